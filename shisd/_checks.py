@@ -1,0 +1,71 @@
+"""Checks of what callers pass: each error names the argument, what came and what to pass.
+
+Shapes, types and static arguments are known while tracing, so these checks cost nothing at run time.
+"""
+
+import math
+import operator
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from shisd._typing import Array
+
+
+def real_array(name: str, value: ArrayLike) -> Array:
+    """`value` as a floating JAX array: float32 and float64 stay as they are, Python and NumPy integers become floats."""
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` must be an array of real numbers; got {type(value).__name__}.") from error
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.bool_):
+        return array.astype(float)
+    raise ValueError(f"`{name}` must hold real numbers; got dtype {array.dtype}. Pass float32 or float64.")
+
+
+def vectors(name: str, value: ArrayLike) -> Array:
+    """`value` as floating vectors [..., 3]."""
+    array = real_array(name, value)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"`{name}` must have shape [..., 3]; got {list(array.shape)}.")
+    return array
+
+
+def matrix(name: str, value: ArrayLike) -> Array:
+    """`value` as one floating [3, 3] matrix."""
+    array = real_array(name, value)
+    if array.shape != (3, 3):
+        raise ValueError(f"`{name}` must have shape [3, 3]; got {list(array.shape)}. Batch it with jax.vmap.")
+    return array
+
+
+def coefficients(name: str, value: ArrayLike) -> tuple[Array, int]:
+    """`value` as floating SH coefficients [..., (L+1)^2], and the degree L."""
+    array = real_array(name, value)
+    size = array.shape[-1] if array.ndim else 0
+    degree = math.isqrt(size) - 1
+    if degree < 0 or (degree + 1) ** 2 != size:
+        raise ValueError(f"`{name}` must have (degree + 1)**2 coefficients on its last axis; got {list(array.shape)}.")
+    return array, degree
+
+
+def integer(name: str, value: object, minimum: int = 0) -> int:
+    """`value` as a static Python integer of at least `minimum`."""
+    if isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"`{name}` must be an integer >= {minimum}; got {value!r}.")
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except Exception as error:  # a tracer raises JAX's own error type
+        message = f"`{name}` must be a Python integer known while tracing; got {type(value).__name__}."
+        raise ValueError(message) from error
+    if number < minimum:
+        raise ValueError(f"`{name}` must be >= {minimum}; got {number}.")
+    return number
+
+
+def degree(value: object) -> int:
+    """The static argument `degree`, the highest band L, inclusive."""
+    return integer("degree", value)
