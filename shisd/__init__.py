@@ -1,5 +1,8 @@
 """Spherical kernels as weighted sums of rotated zonal harmonics, differentiable from material and light to radiance."""
 
+from shisd import decomposition as decomposition
 from shisd import harmonics as harmonics
+from shisd import models as models
+from shisd import shading as shading
 
 __version__ = "0.1.0"

@@ -9,3 +9,32 @@ def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """Unit vectors along `vectors`, without overflow or underflow at any scale; a zero vector gives NaN."""
     scaled = vectors / jnp.max(jnp.abs(vectors), axis=-1, keepdims=True)
     return scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
+
+
+def angle_multiples(
+    cos: Float[Array, "*batch"], sin: Float[Array, "*batch"], count: int
+) -> tuple[Float[Array, "*batch {count}"], Float[Array, "*batch {count}"]]:
+    """cos(k a) and sin(k a) for k = 0 ... count-1 on a new last axis, from cos(a) and sin(a).
+
+    Powers of a unit complex number as products of two short tables, a few of them at once: k = giant * i + baby. Every
+    power is at most 2 log2(count) products away from the first, so the rounding grows with k, not with k^2.
+    """
+    baby = 1 << (max(count - 1, 1).bit_length() + 1) // 2
+    giant = -(-count // baby)
+    c, s = _chain(cos, sin, baby + 1)
+    big_c, big_s = _chain(c[baby], s[baby], giant)
+    c, s = (jnp.stack(p[:baby], axis=-1)[..., None, :] for p in (c, s))
+    big_c, big_s = (jnp.stack(p, axis=-1)[..., :, None] for p in (big_c, big_s))
+    shape = (*cos.shape, giant * baby)
+    real, imag = big_c * c - big_s * s, big_s * c + big_c * s
+    return real.reshape(shape)[..., :count], imag.reshape(shape)[..., :count]
+
+
+def _chain(cos: Array, sin: Array, count: int) -> tuple[list[Array], list[Array]]:
+    """The first `count` powers by halving: power k is the product of powers k // 2 and k - k // 2."""
+    c, s = [jnp.ones_like(cos), cos], [jnp.zeros_like(sin), sin]
+    for k in range(2, count):
+        i, j = k // 2, k - k // 2
+        c.append(c[i] * c[j] - s[i] * s[j])
+        s.append(s[i] * c[j] + c[i] * s[j])
+    return c[:count], s[:count]

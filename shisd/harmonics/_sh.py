@@ -1,38 +1,196 @@
-"""Real spherical harmonics (placeholder formulation: rows of the recurrence, points last)."""
+"""Real spherical harmonics: the basis, and expansions without the basis.
 
+Follows ISD15s Eq. 3-5 for the definition and its stable normalised recurrence, run once on the host in float64. At run
+time the polar functions are evaluated from their Fourier series in the polar angle (`_tables.polar_series`) as matrix
+products: on float32 this is about ten times more exact at degree 100 than running the recurrence.
+
+Derivatives do not come from these formulas: the gradient of the solid harmonic r^l y_l^m is a combination of harmonics
+of degree l-1, so it is exact at the poles, to every order.
+
+notation: u = (x, y, z), rho = sqrt(x^2 + y^2) = sin(theta), z = cos(theta); y_l^m as in ISD15 Eq. 7.
+"""
+
+import functools
+
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import angle_multiples, normalize
 from shisd._typing import Array, Float
 from shisd.harmonics import _tables
 
+_POINTS_AT_ONCE = 1 << 15  # beyond this, expansions are evaluated in tiles so that memory stays bounded
+
 
 def sh_basis(directions: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
-    directions = normalize(_checks.vectors("directions", directions))
+    """Real orthonormal spherical harmonics y_l^m of each direction.
+
+    Arguments: `directions` [..., 3], of any length (only the direction counts; a zero vector gives NaN); static
+    `degree` L >= 0. Returns [..., (L+1)^2] in the dtype of `directions`, index l*(l+1)+m.
+    Derivatives: in `directions`, every order, both modes, exact at the poles.
+    Accuracy: 1e-13 at degree 30 and 1e-12 at degree 100 in float64; 3e-6 at degree 16 and 3e-5 at degree 100 in float32.
+    Cost: a matrix product with L+1 columns per two coefficients; the result is (L+1)^2 numbers per direction, so to
+    evaluate an expansion use `evaluate`.
+    Source: ISD15 Eq. 7, ISD15s Eq. 3-5.
+    """
     degree = _checks.degree(degree)
-    s, a, b = _tables.recurrence(degree)
-    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
-    out = {}
-    c, q = jnp.ones_like(x), jnp.zeros_like(x)
-    pmm = jnp.full_like(x, float(jnp.sqrt(1 / (4 * jnp.pi))))
-    for m in range(degree + 1):
-        if m:
-            c, q = c * x - q * y, q * x + c * y
-            pmm = float(s[m]) * pmm
-        prev, cur = jnp.zeros_like(x), pmm
-        for l in range(m, degree + 1):
-            if l > m:
-                prev, cur = cur, float(a[l, m]) * z * cur - float(b[l, m]) * prev
-            if m == 0:
-                out[l, 0] = cur
-            else:
-                out[l, m] = float(jnp.sqrt(2.0)) * cur * c
-                out[l, -m] = float(jnp.sqrt(2.0)) * cur * q
-    return jnp.stack([out[l, m] for l in range(degree + 1) for m in range(-l, l + 1)], axis=-1)
+    return _jitted_basis(_checks.vectors("directions", directions), degree)
 
 
 def evaluate(coefficients: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
+    """Values of spherical-harmonic expansions: sum over (l, m) of coefficients[l, m] y_l^m(direction).
+
+    Arguments: `coefficients` [..., (L+1)^2]; `directions` [..., 3] of any length (a zero vector gives NaN). The batch
+    axes broadcast as in NumPy: coefficients [3, 1, n] at directions [N, 3] give [3, N].
+    Derivatives: in both arguments, every order, both modes, exact at the poles.
+    Accuracy: as `sh_basis`, relative to the sum of the absolute coefficients.
+    Cost: where no axis batches both arguments, the basis is never built: the expansion becomes a Fourier series in both
+    angles, (L+1)(2L+1) products per point, in tiles of bounded memory.
+    """
     c, degree = _checks.coefficients("coefficients", coefficients)
-    return jnp.sum(c * sh_basis(directions, degree), axis=-1)
+    d = _checks.vectors("directions", directions)
+    if c.dtype != d.dtype:
+        dtype = jnp.promote_types(c.dtype, d.dtype)
+        c, d = c.astype(dtype), d.astype(dtype)
+    try:
+        np.broadcast_shapes(c.shape[:-1], d.shape[:-1])
+    except ValueError as error:
+        raise ValueError(
+            f"batch axes of `coefficients` {list(c.shape)} and `directions` {list(d.shape)} do not broadcast; "
+            "for every expansion at every direction pass coefficients[..., None, :]."
+        ) from error
+    rank = max(c.ndim, d.ndim)
+    c, d = (a.reshape((1,) * (rank - a.ndim) + a.shape) for a in (c, d))
+    return _evaluate(c, d, degree)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _jitted_basis(directions: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]:
+    return _basis(normalize(directions), degree)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _evaluate(c: Float[Array, "*c n"], directions: Float[Array, "*d 3"], degree: int) -> Float[Array, "*batch"]:
+    """`c` and `directions` of equal rank, their batch axes broadcast."""
+    u, rank = normalize(directions), c.ndim - 1
+    if any(i > 1 and j > 1 for i, j in zip(c.shape[:-1], u.shape[:-1], strict=True)):
+        return jnp.sum(c * _basis(u, degree), axis=-1)
+    values = _expand(c.reshape(-1, c.shape[-1]), u.reshape(-1, 3), degree)
+    values = values.reshape(c.shape[:-1] + u.shape[:-1])
+    pairs = [axis for pair in zip(range(rank), range(rank, 2 * rank), strict=True) for axis in pair]
+    return values.transpose(pairs).reshape(np.broadcast_shapes(c.shape[:-1], u.shape[:-1]))
+
+
+def _azimuth(u: Float[Array, "*batch 3"]) -> tuple[Array, Array, Array]:
+    """rho, cos(phi), sin(phi); phi = 0 at the poles, where every y_l^m with m != 0 vanishes."""
+    rho = jnp.sqrt(u[..., 0] * u[..., 0] + u[..., 1] * u[..., 1])
+    safe = jnp.where(rho > 0, rho, 1)
+    return rho, jnp.where(rho > 0, u[..., 0] / safe, 1), u[..., 1] / safe
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]:
+    """The basis at unit vectors; off the sphere (in derivatives) the solid harmonics r^l y_l^m."""
+    size = (degree + 1) ** 2
+    rho, cos_phi, sin_phi = _azimuth(u)
+    cos, sin = angle_multiples(u[..., 2], rho, degree + 1)
+    cos_m, sin_m = angle_multiples(cos_phi, sin_phi, degree + 1)
+    even, odd, factors = (jnp.asarray(table, u.dtype) for table in _basis_tables(degree))
+    # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
+    azimuth = jnp.concatenate([cos_m, sin_m], axis=-1) @ factors
+    order = _tables.orders(degree) + degree
+    # Index l*(l+1)+m has the parity of m, so cosine and sine series alternate along the last axis.
+    pairs = jnp.stack(
+        [
+            (cos @ even) * azimuth[..., order[0::2]],
+            (sin @ odd) * azimuth[..., np.append(order[1::2], 0)[: even.shape[1]]],
+        ],
+        axis=-1,
+    )
+    return pairs.reshape(*u.shape[:-1], -1)[..., :size]
+
+
+@_basis.defjvp
+def _basis_jvp(degree, primals, tangents):
+    (u,), (du,) = primals, tangents
+    y = _basis(u, degree)
+    dy = jnp.zeros_like(y)
+    for axis, terms in enumerate(_tables.gradient_gather(degree, transpose=False)):
+        for index, factor in terms:
+            dy += jnp.einsum("...,j,...j->...j", du[..., axis], jnp.asarray(factor, u.dtype), y[..., index])
+    return y, dy
+
+
+@functools.cache
+def _basis_tables(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Polar series of the even and of the odd orders [L+1, ceil(n/2)], and the map from cos, sin(m phi) to the orders."""
+    series, m = _tables.polar_series(degree), _tables.orders(degree)
+    table = series[np.abs(m), :, _tables.bands(degree)].T * np.where(m == 0, 1, np.sqrt(2))
+    even, odd = table[:, 0::2], table[:, 1::2]
+    odd = np.pad(odd, ((0, 0), (0, even.shape[1] - odd.shape[1])))
+    factors = np.zeros((2 * (degree + 1), 2 * degree + 1))
+    m = np.arange(-degree, degree + 1)
+    factors[np.where(m >= 0, m, degree + 1 - m), m + degree] = 1
+    return even, odd, factors
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _expand(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) -> Float[Array, "f points"]:
+    """Every expansion at every unit vector, as a double Fourier series."""
+    even, odd = _fourier(c, degree)
+
+    def at(u: Float[Array, "3"]) -> Float[Array, " f"]:
+        rho, cos_phi, sin_phi = _azimuth(u)
+        cos, sin = angle_multiples(u[2], rho, degree + 1)
+        cos_m, sin_m = angle_multiples(cos_phi, sin_phi, degree + 1)
+        e, o = (cos @ even).reshape(c.shape[0], 2, -1), (sin @ odd).reshape(c.shape[0], 2, -1)
+        trig = jnp.stack([cos_m, sin_m])[None]
+        return jnp.sum(e * trig[..., 0::2], axis=(1, 2)) + jnp.sum(o * trig[..., 1::2], axis=(1, 2))
+
+    if u.shape[0] <= _POINTS_AT_ONCE:
+        return jax.vmap(at, out_axes=1)(u)
+    return jax.lax.map(at, u, batch_size=_POINTS_AT_ONCE).T
+
+
+def _expand_jvp(degree, primals, tangents):
+    (c, u), (dc, du) = primals, tangents
+    values = _expand(c, u, degree)
+    dvalues = jnp.zeros_like(values)
+    if not isinstance(dc, SymbolicZero):  # through the basis: the transpose of the series is not smooth at the poles
+        dvalues += _expand_by_basis(dc, u, degree)
+    if degree > 0 and not isinstance(du, SymbolicZero):
+        gradients = [
+            sum(jnp.asarray(factor[None, :], c.dtype) * c[:, index] for index, factor in terms)
+            for terms in _tables.gradient_gather(degree, transpose=True)
+        ]
+        slopes = _expand(jnp.concatenate(gradients), u, degree - 1).reshape(3, c.shape[0], -1)
+        dvalues += jnp.sum(slopes * du.T[:, None, :], axis=0)
+    return values, dvalues
+
+
+_expand.defjvp(_expand_jvp, symbolic_zeros=True)
+
+
+def _expand_by_basis(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) -> Float[Array, "f points"]:
+    """The same values as products with the basis, which is made again in the backward pass rather than stored."""
+    if u.shape[0] <= _POINTS_AT_ONCE:
+        return c @ _basis(u, degree).T
+    return jax.lax.map(jax.checkpoint(lambda u: c @ _basis(u, degree)), u, batch_size=_POINTS_AT_ONCE // 8).T
+
+
+def _fourier(c: Float[Array, "f n"], degree: int) -> tuple[Array, Array]:
+    """Double Fourier coefficients of expansions, for even and for odd orders m: [L+1 over k, f * 2 * orders]."""
+    l = np.arange(degree + 1)
+    m = l[:, None]
+    positive = jnp.where((l >= m)[None], c[:, np.where(l >= m, l * l + l + m, 0)], 0)  # [f, m, l]
+    negative = jnp.where(((l >= m) & (m > 0))[None], c[:, np.where(l >= m, l * l + l - m, 0)], 0)
+    both = jnp.stack([positive, negative], axis=1)
+    scaled = _tables.polar_series(degree) * np.where(m == 0, 1, np.sqrt(2))[:, :, None]
+    series = jnp.asarray(scaled, c.dtype)
+    even = jnp.einsum("mkl,fsml->kfsm", series[0::2], both[:, :, 0::2])
+    odd = jnp.einsum("mkl,fsml->kfsm", series[1::2], both[:, :, 1::2])
+    return even.reshape(degree + 1, -1), odd.reshape(degree + 1, -1)

@@ -8,6 +8,8 @@ import functools
 
 import numpy as np
 
+Gather = tuple[tuple[np.ndarray, np.ndarray], ...]
+
 
 @functools.cache
 def recurrence(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -55,3 +57,192 @@ def bands(degree: int) -> np.ndarray:
 def orders(degree: int) -> np.ndarray:
     """The order m of each coefficient."""
     return np.concatenate([np.arange(-l, l + 1) for l in range(degree + 1)])
+
+
+@functools.cache
+def polar_series(degree: int) -> np.ndarray:
+    """Fourier series of p in the polar angle, as [L+1, L+1, L+1] over (m, k, l).
+
+    p[l, m](theta) = sum_k series[m, k, l] cos(k theta) for even m and sum_k series[m, k, l] sin(k theta) for odd m:
+    sin^m times a polynomial of degree l - m in cos. Sampled at L + 2 midpoints, where the sums are orthogonal.
+    """
+    count = degree + 2
+    theta = (np.arange(count) + 0.5) * np.pi / count
+    p = associated_legendre(theta, degree)
+    k_theta = np.outer(np.arange(degree + 1), theta)
+    cos, sin = np.cos(k_theta) * 2 / count, np.sin(k_theta) * 2 / count
+    cos[0] /= 2
+    series = np.empty((degree + 1,) * 3)
+    series[0::2] = np.einsum("kj,lmj->mkl", cos, p[:, 0::2], optimize=True)
+    series[1::2] = np.einsum("kj,lmj->mkl", sin, p[:, 1::2], optimize=True)
+    return series
+
+
+@functools.cache
+def gradient_terms(degree: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
+    """The gradient of r^l y_l^m as a combination of y_(l-1): (row, column, factor) of the nonzero entries, for x, y, z.
+
+    row is the index of (l, m), column that of (l-1, m'). From (d_x +- i d_y) r^l Y_l^m = +-k sqrt((l -+ m)(l -+ m - 1))
+    r^(l-1) Y_(l-1)^(m +- 1) and d_z r^l Y_l^m = k sqrt(l^2 - m^2) r^(l-1) Y_(l-1)^m with k^2 = (2l+1)/(2l-1)
+    (Hobson 1931, 89; checked against finite differences in the tests).
+    """
+    terms = ([], [], [])
+
+    def add(axis: int, l: int, m: int, m_from: int, factor: float) -> None:
+        if abs(m_from) < l and factor:
+            terms[axis].append((l * l + l + m, l * l - l + m_from, factor))
+
+    for l in range(1, degree + 1):
+        k = np.sqrt((2 * l + 1) / (2 * l - 1))
+        for m in range(-l, l + 1):
+            add(2, l, m, m, k * np.sqrt(l * l - m * m))
+        up = k * np.sqrt(l * (l - 1)) / np.sqrt(2)
+        add(0, l, 0, 1, up)
+        add(1, l, 0, -1, up)
+        for m in range(1, l + 1):
+            up, down = k * np.sqrt((l - m) * (l - m - 1)) / 2, k * np.sqrt((l + m) * (l + m - 1)) / 2
+            if m == 1:  # y_0 has no partner of order -0
+                add(0, l, 1, 0, -np.sqrt(2) * down)
+                add(1, l, -1, 0, -np.sqrt(2) * down)
+            else:
+                add(0, l, m, m - 1, -down)
+                add(0, l, -m, 1 - m, -down)
+                add(1, l, m, 1 - m, down)
+                add(1, l, -m, m - 1, -down)
+            add(0, l, m, m + 1, up)
+            add(0, l, -m, -m - 1, up)
+            add(1, l, m, -m - 1, up)
+            add(1, l, -m, m + 1, -up)
+    return tuple(
+        (
+            np.array([t[0] for t in axis], int),
+            np.array([t[1] for t in axis], int),
+            np.array([t[2] for t in axis], float),
+        )
+        for axis in terms
+    )
+
+
+@functools.cache
+def gradient_gather(degree: int, transpose: bool) -> tuple[Gather, ...]:
+    """`gradient_terms` for x, y, z over the rows (or, transposed, over the columns)."""
+    size = degree * degree if transpose else (degree + 1) ** 2
+    return tuple(
+        _gather(column, row, factor, size) if transpose else _gather(row, column, factor, size)
+        for row, column, factor in gradient_terms(degree)
+    )
+
+
+@functools.cache
+def generator_gather(degree: int) -> tuple[Gather, ...]:
+    """Coefficients of the rotation rates: (G_i c) is the derivative of c under rotation about axis i = x, y, z.
+
+    G_n = -i L_n with L_+- Y_l^m = sqrt((l -+ m)(l +- m + 1)) Y_l^(m +- 1), written for the real functions.
+    """
+    terms: tuple[list, ...] = ([], [], [])
+
+    def add(axis: int, l: int, m_to: int, m_from: int, factor: float) -> None:
+        if abs(m_to) <= l and factor:
+            terms[axis].append((l * l + l + m_to, l * l + l + m_from, factor))
+
+    for l in range(1, degree + 1):
+        for m in range(-l, l + 1):
+            add(2, l, m, -m, -m)
+        a = np.sqrt(l * (l + 1) / 2)
+        add(0, l, -1, 0, a)
+        add(1, l, 1, 0, -a)
+        for m in range(1, l + 1):
+            a, b = np.sqrt((l - m) * (l + m + 1)) / 2, np.sqrt((l + m) * (l - m + 1)) / 2
+            if m == 1:  # y_0 has no partner of order -0
+                add(0, l, 0, -1, -np.sqrt(2) * b)
+                add(1, l, 0, 1, np.sqrt(2) * b)
+            else:
+                add(0, l, 1 - m, m, b)
+                add(0, l, m - 1, -m, -b)
+                add(1, l, m - 1, m, b)
+                add(1, l, 1 - m, -m, b)
+            add(0, l, -m - 1, m, a)
+            add(0, l, m + 1, -m, -a)
+            add(1, l, m + 1, m, -a)
+            add(1, l, -m - 1, -m, -a)
+    return tuple(
+        _gather(*(np.array(column) for column in zip(*axis, strict=True)), (degree + 1) ** 2) for axis in terms
+    )
+
+
+def _gather(target: np.ndarray, source: np.ndarray, factor: np.ndarray, size: int) -> Gather:
+    """A sparse matrix as (index, factor) pairs: (A v)[i] = sum over pairs of factor[i] * v[index[i]]."""
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    filled = np.zeros(size, int)
+    for t, s, f in zip(target, source, factor, strict=True):
+        if filled[t] == len(pairs):
+            pairs.append((np.zeros(size, int), np.zeros(size)))
+        index, weight = pairs[filled[t]]
+        index[t], weight[t] = s, f
+        filled[t] += 1
+    return tuple(pairs)
+
+
+@functools.cache
+def swap_matrices(degree: int) -> tuple[np.ndarray, ...]:
+    """J_l of every band: y_l(x, z, y) = J_l y_l(x, y, z). Symmetric, orthogonal, its own inverse.
+
+    From Wigner's d(pi/2), by its recurrence in degree at fixed orders (Varshalovich et al. 1988, 4.8.2, at cos = 0),
+    since the swap is the quarter turn about x followed by y -> -y, and a turn about x is one about y seen from Rz(pi/2).
+    """
+    m = np.arange(-degree, degree + 1)
+    row, column = np.meshgrid(m, m, indexing="ij")
+    start = np.maximum(np.abs(row), np.abs(column))
+    d_start = _wigner_start(degree)
+    before, now, matrices = np.zeros_like(d_start), np.zeros_like(d_start), []
+    for l in range(degree + 1):
+        if l > 0:
+            k = l - 1  # d^l from d^(l-1) and d^(l-2)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                root = np.sqrt(np.maximum((l * l - row**2) * (l * l - column**2), 0.0))
+                back = np.sqrt(np.maximum((k * k - row**2) * (k * k - column**2), 0.0))
+                after = (
+                    (-(2 * k + 1) * row * column * now - l * back * before) / (k * root) if k else np.zeros_like(now)
+                )
+            before, now = now, np.where(start < l, np.nan_to_num(after), 0.0)
+            if l == 1:
+                now[degree, degree] = 0.0  # d^1_00 = cos(pi/2)
+        now = np.where(start == l, d_start, now)
+        inner = slice(degree - l, degree + l + 1)
+        matrices.append(_swap_from_wigner(now[inner, inner], l))
+    return tuple(matrices)
+
+
+def _wigner_start(degree: int) -> np.ndarray:
+    """d^j_(m, m')(pi/2) with j = max(|m|, |m'|), for every m, m': 2^-j sqrt(binomial(2j, j + m')) up to a sign."""
+    d = np.zeros((2 * degree + 1,) * 2)
+    for j in range(degree + 1):
+        value = np.empty(2 * j + 1)  # over m' = -j ... j
+        value[2 * j] = 0.5**j
+        for i in range(2 * j, 0, -1):  # from m' = i - j to m' - 1
+            value[i - 1] = value[i] * np.sqrt(i / (2 * j - i + 1))
+        m = np.arange(-j, j + 1)
+        inner = slice(degree - j, degree + j + 1)
+        d[degree + j, inner] = value * (-1.0) ** (j - m)  # d^j_(j, m')
+        d[degree - j, inner] = value
+        d[inner, degree + j] = value
+        d[inner, degree - j] = value * (-1.0) ** (j + m)
+    return d
+
+
+def _swap_from_wigner(d: np.ndarray, l: int) -> np.ndarray:
+    """J_l from d^l(pi/2): real form of the turn about y, turned by Rz(-pi/2) . Rz(pi/2), then y -> -y."""
+    turn = np.zeros_like(d)  # the quarter turn about y keeps cos(m phi) and sin(m phi) functions apart
+    p = np.arange(1, l + 1)
+    sign = (-1.0) ** p
+    plus, minus = d[np.ix_(l + p, l + p)], d[np.ix_(l + p, l - p)] * sign
+    turn[l, l] = d[l, l]
+    turn[l, l + 1 :] = np.sqrt(2) * d[l, l + 1 :]
+    turn[l + 1 :, l] = np.sqrt(2) * d[l + 1 :, l]
+    turn[np.ix_(l + p, l + p)] = plus + minus
+    turn[np.ix_(l - p, l - p)] = plus - minus
+    z = np.zeros_like(d)  # Rz(pi/2)
+    m = np.arange(-l, l + 1)
+    z[l + m, l + m] = np.round(np.cos(m * np.pi / 2))
+    z[l + m, l - m] -= np.round(np.sin(m * np.pi / 2))
+    return np.where(m < 0, -1.0, 1.0)[:, None] * (z.T @ turn @ z)

@@ -1,0 +1,55 @@
+# `make demo` and `make test` need nothing but Python 3.11 or newer: each sets up .venv/ the first time.
+# Another Python: make PYTHON=python3.12 test
+
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin/python
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-slow lint bench clean
+
+help:
+	@echo "make demo       relight two objects with real maps; pictures and a table go to output/relight"
+	@echo "make test       the tests, without the slow ones"
+	@echo "make test-slow  the slow tests: examples, notebooks, convergence"
+	@echo "make lint       ruff and pyright"
+	@echo "make bench      speed against error, beside other methods"
+	@echo "make clean      remove .venv and output"
+
+demo: $(VENV)/.demo
+	$(RUN) examples/relight.py --output output/relight --overwrite
+
+test: $(VENV)/.test
+	$(RUN) -m pytest -m "not slow"
+
+test-slow: $(VENV)/.test
+	$(RUN) -m pytest -m slow
+
+lint: $(VENV)/.test
+	$(RUN) -m ruff check .
+	$(RUN) -m pyright --pythonpath $(RUN)
+
+bench: $(VENV)/.test
+	$(RUN) -m tests.bench.run
+
+clean:
+	rm -rf $(VENV) output
+
+# One stamp per set of packages, renewed when pyproject.toml changes.
+$(VENV)/.demo: pyproject.toml | $(VENV)/.created
+	@echo "Installing what the demo needs into $(VENV)/ ..."
+	@$(RUN) -m pip install --quiet --disable-pip-version-check -e '.[demo]'
+	@touch $@
+
+$(VENV)/.test: pyproject.toml | $(VENV)/.created
+	@echo "Installing what the tests need into $(VENV)/ ..."
+	@$(RUN) -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	@touch $@ $(VENV)/.demo
+
+$(VENV)/.created:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "shisd needs Python 3.11 or newer, and '$(PYTHON)' is not. Name one: make PYTHON=python3.12 demo" >&2; exit 1; }
+	@$(PYTHON) -m venv --clear $(VENV) || { \
+	  echo "Could not make a virtual environment. On Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	@touch $@

@@ -1,0 +1,74 @@
+"""What a picture needs besides shading: a camera, an object's visible points, and pixels put back in their places."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass
+class View:
+    """The pixels of a square picture: rays for all of them, and normals and views [N, 3] where the object is seen."""
+
+    rays: np.ndarray  # [size, size, 3], unit, from the camera
+    seen: np.ndarray  # [size, size], bool
+    normals: np.ndarray
+    views: np.ndarray
+
+    def picture(self, values: np.ndarray, background: np.ndarray | float = 0.0) -> np.ndarray:
+        """[size, size, 3] from the values [N, 3] of the seen pixels."""
+        image = np.broadcast_to(background, (*self.seen.shape, 3)).copy()
+        image[self.seen] = values
+        return image
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def camera_rays(size: int, eye: np.ndarray, target: np.ndarray, field_of_view: float) -> np.ndarray:
+    """Unit rays [size, size, 3] of a perspective camera with +z up; rows from the top, one ray per pixel centre."""
+    forward = unit(target - eye)
+    right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
+    up = np.cross(right, forward)
+    t = np.tan(field_of_view / 2) * (2 * (np.arange(size) + 0.5) / size - 1)
+    return unit(forward + t[None, :, None] * right - t[:, None, None] * up)
+
+
+def _view(rays: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> View:
+    """Interpolated normals may face away from the camera: bend those just enough that the camera sees them."""
+    views = -rays[seen]
+    facing = np.sum(normals * views, axis=1, keepdims=True)
+    normals = unit(normals + np.maximum(0.05 - facing, 0) * views)
+    return View(rays, seen, normals.astype(np.float32), views.astype(np.float32))
+
+
+def sphere(size: int, azimuth: float) -> View:
+    """The unit sphere at the origin."""
+    eye = 4.2 * np.array([np.cos(azimuth), np.sin(azimuth), 0.15])
+    rays = camera_rays(size, eye, np.zeros(3), np.radians(32))
+    along = -rays @ eye
+    inside = along**2 - eye @ eye + 1
+    seen = inside > 0
+    points = eye + (along - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
+    return _view(rays, seen, points[seen])
+
+
+def mesh(path: Path, size: int, azimuth: float) -> View:
+    """A mesh that was modelled with +y up, turned to +z up, with smooth normals."""
+    import trimesh
+
+    shape = trimesh.load_mesh(path)
+    shape.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    shape.apply_translation(-shape.bounds.mean(axis=0))
+    eye = 4.4 * np.array([np.cos(azimuth), np.sin(azimuth), 0.25])
+    rays = camera_rays(size, eye, np.zeros(3), np.radians(27))
+    flat = rays.reshape(-1, 3)
+    points, ray, face = shape.ray.intersects_location(np.broadcast_to(eye, flat.shape), flat, multiple_hits=False)
+    order = np.argsort(ray)
+    points, ray, face = points[order], ray[order], face[order]
+    weights = trimesh.triangles.points_to_barycentric(shape.triangles[face], points)
+    normals = unit(np.einsum("nk,nkx->nx", weights, shape.vertex_normals[shape.faces[face]]))
+    seen = np.zeros(len(flat), bool)
+    seen[ray] = True
+    return _view(rays, seen.reshape(size, size), normals)

@@ -1,0 +1,12 @@
+"""Stage 2: isotropic spherical decomposition (ISD15), coefficients <-> weights of rotated kernels.
+
+Conventions: axes are unit vectors, z and -z are one axis; weights [..., L+1, K] multiply y_l^0(w . z_k).
+"""
+
+from shisd.decomposition._basis import RotatedZonalBasis as RotatedZonalBasis
+from shisd.decomposition._directions import conditioning_loss as conditioning_loss
+from shisd.decomposition._directions import fibonacci_directions as fibonacci_directions
+from shisd.decomposition._directions import low_discrepancy_directions as low_discrepancy_directions
+from shisd.decomposition._directions import optimize_directions as optimize_directions
+from shisd.decomposition._directions import optimized_directions as optimized_directions
+from shisd.decomposition._directions import random_directions as random_directions

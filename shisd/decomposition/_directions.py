@@ -1,0 +1,175 @@
+"""Sets of lobe axes: Fibonacci, low-discrepancy, random, the shipped optimised table, and the optimiser that made it.
+
+ISD15 section 5.1 spreads 2l+1 directions per band, or shares one list among bands ("lobe sharing"). Two differences
+here. First, these are *axes*: a zonal harmonic about -z is the one about z times (-1)^l, so z and -z serve every band
+alike, and sets are spread over the upper hemisphere, one direction per antipodal pair. 2L+1 Fibonacci *points* of the
+sphere are worse than that: they map to themselves under a half-turn about a horizontal line, which makes L+1 symmetric
+sums of lobes, but for odd L band L has only L symmetric functions, so the band is singular. Second, directions can be
+optimised for the conditioning that ISD15 section 5 asks for.
+"""
+
+import functools
+import importlib.resources
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.typing import ArrayLike, DTypeLike
+
+from shisd import _checks
+from shisd._numerics import normalize
+from shisd._typing import Array, Float, Scalar
+from shisd.harmonics import legendre
+
+_TABLE_DEGREE = 32
+
+
+def fibonacci_directions(count: int, *, dtype: DTypeLike = float) -> Float[Array, "{count} 3"]:
+    """A Fibonacci spiral of `count` axes: golden-angle steps in azimuth, equal steps in z from 1 to 0.
+
+    Arguments: static `count` >= 1. Returns unit vectors [count, 3] with z > 0, in `dtype` (default: JAX's float).
+    Worst-band condition number of 2L+1 of them in degree L: 2 to 350 up to degree 32.
+    """
+    i = np.arange(_checks.integer("count", count, 1))
+    return jnp.asarray(_upper((i + 0.5) / i.size, i * (np.sqrt(5) - 1) / 2), dtype=dtype)
+
+
+def low_discrepancy_directions(count: int, *, dtype: DTypeLike = float) -> Float[Array, "{count} 3"]:
+    """The first `count` Halton points (bases 2 and 3) as axes: a longer set begins with the shorter ones.
+
+    Arguments: static `count` >= 1. Returns unit vectors [count, 3] with z > 0, in `dtype` (default: JAX's float).
+    Worst-band condition number of 2L+1 of them in degree L: 2 to 400 up to degree 30, and 7000 at degree 32.
+    """
+    i = np.arange(1, _checks.integer("count", count, 1) + 1)
+    return jnp.asarray(_upper(_radical_inverse(i, 2), _radical_inverse(i, 3)), dtype=dtype)
+
+
+def random_directions(count: int, key: Array, *, dtype: DTypeLike = float) -> Float[Array, "{count} 3"]:
+    """`count` independent axes, uniform on the upper hemisphere.
+
+    Arguments: static `count` >= 1; a JAX random `key`. Returns unit vectors [count, 3] with z >= 0, in `dtype`
+    (default: JAX's float). Pairs may be close: condition numbers of 100 to 10000 are common, so draw more than 2L+1 or
+    improve them with `optimize_directions`.
+    """
+    z = normalize(jax.random.normal(key, (_checks.integer("count", count, 1), 3), dtype=dtype))
+    return jnp.where(z[:, 2:] < 0, -z, z)
+
+
+def optimized_directions(degree: int, *, dtype: DTypeLike = float) -> Float[Array, "2*{degree}+1 3"]:
+    """The best known 2L+1 shared axes for degree L = 0 ... 32, from the shipped table.
+
+    Arguments: static `degree`. Returns unit vectors [2L+1, 3] with z >= 0, in `dtype` (default: JAX's float). The first
+    2l+1 of them also serve band l alone (`RotatedZonalBasis(..., nested=True)`), less well.
+    Accuracy: worst-band condition numbers 2.3, 2.9, 4.4, 6.4, 8.8 at degree 4, 8, 12, 20, 32; up to 190 with `nested`.
+    Source: `optimize_directions` from many starts; tests/bench/make_directions.py makes the table.
+    """
+    degree = _checks.degree(degree)
+    if degree > _TABLE_DEGREE:
+        raise ValueError(
+            f"`degree` must be <= {_TABLE_DEGREE}, where the table ends; got {degree}. Use "
+            f"decomposition.fibonacci_directions({2 * degree + 1}), and improve them with "
+            "decomposition.optimize_directions if their condition numbers matter."
+        )
+    return jnp.asarray(_table()[degree**2 : (degree + 1) ** 2], dtype=dtype)
+
+
+def conditioning_loss(directions: ArrayLike, degree: int, *, power: ArrayLike = 8.0) -> Scalar:
+    """A smooth bound on the worst band's log condition number: what `optimize_directions` makes small.
+
+    With mu the 2l+1 eigenvalues of M_l M_l^T (ISD15 Eq. 10), which are the nonzero ones of the Gram matrix
+    P_l(z_i . z_j), in units of their mean K/(2l+1):
+
+        loss = 1/(2p) log sum_l (sum_i mu_i^p) (sum_i mu_i^-p)
+
+    It exceeds max_l log cond(M_l) by at most log((2L+1) sqrt(L+1)) / p, and tends to it as `power` p grows.
+
+    Arguments: `directions` [K, 3], nonzero, taken as unit vectors along them; static `degree` L, with K >= 2L+1;
+    `power` > 0.
+    Derivatives: in directions, first order, both modes, also where eigenvalues meet, because the sums are symmetric in
+    them. Infinite or NaN for singular sets.
+    """
+    z, degree = _axes(directions, degree)
+    size = z.shape[0]
+    # Legendre polynomials at cosines that rounding left above 1 are harmless: the recurrence is a polynomial.
+    gram = jnp.moveaxis(legendre(jnp.einsum("ic,jc->ij", z, z), degree), -1, 0)  # [L+1, K, K]
+    mean = jnp.asarray(size / (2 * np.arange(degree + 1) + 1), dtype=z.dtype)
+    mu = jnp.linalg.eigvalsh(gram) / mean[:, None]  # ascending, so the last 2l+1 belong to band l
+    kept = np.arange(size) >= size - (2 * np.arange(degree + 1)[:, None] + 1)
+    log_mu = jnp.where(kept, jnp.log(jnp.where(kept, mu, 1)), -jnp.inf)
+    inverse = jnp.where(kept, -log_mu, -jnp.inf)
+    p = jnp.asarray(power, dtype=z.dtype)
+    bands = jax.nn.logsumexp(p * log_mu, axis=1) + jax.nn.logsumexp(p * inverse, axis=1)
+    return jax.nn.logsumexp(bands) / (2 * p)
+
+
+def optimize_directions(
+    directions: ArrayLike, degree: int, *, powers: tuple[float, ...] = (1.0, 3.0, 8.0), max_steps: int = 256
+) -> Float[Array, "K 3"]:
+    """`directions` moved to lower the worst condition number of bands 0 ... `degree`.
+
+    BFGS on `conditioning_loss`, its power raised through `powers`: low powers spread all axes, high ones work on the
+    worst band. Finds a local minimum that depends on the start; deterministic.
+
+    Arguments: `directions` [K, 3], the start, nonzero; static `degree` L, with K >= 2L+1; at most `max_steps` steps per
+    power. Returns unit vectors in the same order, hemispheres not restored. Work in float64 for the last digits.
+    A singular start, whose loss is not finite, comes back as it is: the basis refuses it with a clear message.
+    Derivatives: none are meant; differentiate `conditioning_loss`.
+    """
+    z, degree = _axes(directions, degree)
+    return _minimise(z, jnp.asarray(powers, dtype=z.dtype), degree, _checks.integer("max_steps", max_steps, 1))
+
+
+@eqx.filter_jit
+def _minimise(z: Float[Array, "K 3"], powers: Float[Array, " p"], degree: int, max_steps: int) -> Float[Array, "K 3"]:
+    loss = lambda x, power: conditioning_loss(x, degree, power=power)
+    tolerance = float(jnp.finfo(z.dtype).eps) ** 0.5
+    solver = optx.BFGS(rtol=tolerance, atol=tolerance)
+
+    def stage(z, power):
+        found = normalize(optx.minimise(loss, solver, z, power, max_steps=max_steps, throw=False).value)
+        return jnp.where(loss(found, power) < loss(z, power), found, z), None  # False for NaN
+
+    return jax.lax.scan(stage, z, powers)[0]
+
+
+def _axes(directions: ArrayLike, degree: int) -> tuple[Float[Array, "K 3"], int]:
+    z, degree = _checks.vectors("directions", directions), _checks.degree(degree)
+    check_count(z, degree)
+    return normalize(z), degree
+
+
+def check_count(directions: Array, degree: int) -> None:
+    """ValueError unless `directions` is one list of enough axes for `degree`."""
+    if directions.ndim != 2:
+        raise ValueError(f"`directions` must have shape [K, 3]; got {list(directions.shape)}. Batch with jax.vmap.")
+    if directions.shape[0] < 2 * degree + 1:
+        raise ValueError(
+            f"`directions` must hold at least 2*degree + 1 = {2 * degree + 1} axes for degree {degree}; got "
+            f"{directions.shape[0]}. Add directions, lower the degree, or use decomposition.optimized_directions."
+        )
+
+
+def _upper(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The unit square on the upper hemisphere, areas kept: z = u, azimuth = 2 pi v."""
+    sine, azimuth = np.sqrt(1 - u * u), 2 * np.pi * v
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), u], axis=-1)
+
+
+def _radical_inverse(i: np.ndarray, base: int) -> np.ndarray:
+    """The digits of the integers `i` in `base`, mirrored behind the point."""
+    total, scale = np.zeros(i.shape), 1.0
+    while i.any():
+        i, digit = np.divmod(i, base)
+        scale /= base
+        total += scale * digit
+    return total
+
+
+@functools.cache
+def _table() -> np.ndarray:
+    """All degrees one after another: rows L^2 ... (L+1)^2 - 1 are the 2L+1 axes of degree L."""
+    with importlib.resources.files("shisd.decomposition").joinpath("data/optimized_directions.npz").open("rb") as file:
+        with np.load(file) as data:
+            return data["directions"]

@@ -1,0 +1,122 @@
+"""Products of expansions.
+
+Products are made where they are simple: on a grid that is fine enough for the result to be exact. The grid is a product
+of rows and columns, so every step is a transform in one variable, and no basis is built over the points of the grid.
+
+notation: g, f = expansions of degrees L_g, L; p_lm, T_m(phi) = polar and azimuthal factors of y_l^m.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from shisd import _checks
+from shisd._typing import Array, Float
+from shisd.harmonics import _quadrature, _tables, _transform
+
+
+def multiply(a: ArrayLike, b: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
+    """Coefficients, up to `degree`, of the product of two expansions; exact, with no error of truncation or aliasing.
+
+    Arguments: `a` [..., (La+1)^2] and `b` [..., (Lb+1)^2], of any two degrees, whose batch axes broadcast; static
+    `degree`. Above La + Lb the product has no coefficients, and zeros are returned.
+    Derivatives: linear in each argument.
+    Accuracy: 1e-14 in float64 and 1e-6 in float32 of the product of the norms at degree 16.
+    Cost: two syntheses and one analysis on (La + Lb + degree)^2 / 2 points.
+    """
+    a, degree_a = _checks.coefficients("a", a)
+    b, degree_b = _checks.coefficients("b", b)
+    degree = _checks.degree(degree)
+    dtype = jnp.promote_types(a.dtype, b.dtype)
+    try:
+        shape = np.broadcast_shapes(a.shape[:-1], b.shape[:-1])
+    except ValueError as error:
+        raise ValueError(f"batch axes of `a` {list(a.shape)} and `b` {list(b.shape)} do not broadcast.") from error
+    kept = min(degree, degree_a + degree_b)
+    rows, columns = _grid(degree_a + degree_b + kept)
+
+    def on_grid(c: Array) -> Array:
+        values = _transform.synthesize(c.astype(dtype).reshape(-1, c.shape[-1]), "gauss", rows, columns)
+        return values.reshape(rows, columns, *[1] * (len(shape) + 1 - c.ndim), *c.shape[:-1])
+
+    values = on_grid(a) * on_grid(b)
+    product = _transform.analyse(values.reshape(rows, columns, -1), "gauss", kept)
+    product = jnp.pad(product, ((0, 0), (0, (degree + 1) ** 2 - (kept + 1) ** 2)))
+    return product.reshape(*shape, (degree + 1) ** 2)
+
+
+def product_matrix(coefficients: ArrayLike, degree: int) -> Float[Array, "n n"]:
+    """The matrix of f -> (g f), from coefficients of f up to `degree` to those of the product up to `degree`.
+
+    matrix[i, j] = integral over the sphere of y_i g y_j, the triple product of ISD15; symmetric and exact.
+
+    Arguments: `coefficients` of g [(Lg+1)^2], of any degree (bands above 2 `degree` have no effect); static `degree` L.
+    Returns [(L+1)^2, (L+1)^2].
+    Derivatives: linear in `coefficients`.
+    Cost: (L+1)^4 times the number of rows, (Lg + 2 L) / 2 + 1; the integral over azimuth is done once for each row and
+    pair of orders.
+    """
+    c, degree_g = _checks.coefficients("coefficients", coefficients)
+    degree = _checks.degree(degree)
+    if c.ndim != 1:
+        raise ValueError(f"`coefficients` must be one expansion; got {list(c.shape)}. Batch it with jax.vmap.")
+    kept = min(degree_g, 2 * degree)
+    rows, columns = _grid(kept + 2 * degree)
+    g = _transform.synthesize(c[None, : (kept + 1) ** 2], "gauss", rows, columns)[..., 0]
+    azimuth, polar, padded = (jnp.asarray(table, c.dtype) for table in _matrix_tables(degree, rows, columns))
+    return _product_matrix(g, azimuth, polar, padded, degree)
+
+
+@functools.partial(jax.jit, static_argnums=4)
+def _product_matrix(g: Array, azimuth: Array, polar: Array, padded: Array, degree: int) -> Float[Array, "n n"]:
+    band, order = _tables.bands(degree), _tables.orders(degree) + degree
+    pairs = jnp.einsum("jc,cm,cn->jmn", g, azimuth, azimuth)  # integral of T_m g T_m' along row j
+    columns = pairs[:, :, order] * polar.T[:, None, :]  # [row, m, column of the matrix]
+    matrix = jnp.einsum("mlj,jmn->mln", padded, columns)[order, band]
+    return (matrix + matrix.T) / 2
+
+
+@functools.cache
+def _matrix_tables(degree: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T_m at the columns [c, m]; p_lm at the rows, by index [n, j]; the same, times texel areas, by order [m, l, j]."""
+    theta, weights = _quadrature.gauss_rows(rows)
+    m = np.arange(-degree, degree + 1)
+    m_phi = np.outer(_quadrature.azimuths(columns), np.abs(m))
+    azimuth = np.where(m < 0, np.sin(m_phi), np.cos(m_phi)) * np.where(m == 0, 1, np.sqrt(2))
+    p = _tables.associated_legendre(theta, degree)
+    padded = p[:, np.abs(m)].transpose(1, 0, 2) * weights * (2 * np.pi / columns)
+    return azimuth, p[_tables.bands(degree), np.abs(_tables.orders(degree))], padded
+
+
+def _grid(degree: int) -> tuple[int, int]:
+    """Rows and columns of the smallest product rule that is exact up to `degree`."""
+    return degree // 2 + 1, degree + 1
+
+
+def convolve(coefficients: ArrayLike, zonal: ArrayLike) -> Float[Array, "*batch n"]:
+    """Coefficients of an expansion convolved with a zonal kernel over all rotations.
+
+    result[l, m] = sqrt(4 pi / (2l + 1)) coefficients[l, m] zonal[l].
+
+    Arguments: `coefficients` [..., (L+1)^2]; `zonal` [..., L+1], the coefficients of y_l^0 of the kernel about +z.
+    Batch axes broadcast.
+    Derivatives: linear in each argument.
+    Source: ISD15 Eq. 13.
+    """
+    c, degree = _checks.coefficients("coefficients", coefficients)
+    k = _checks.real_array("zonal", zonal)
+    if k.ndim == 0 or k.shape[-1] != degree + 1:
+        raise ValueError(f"`zonal` must have shape [..., {degree + 1}], one number for each band; got {list(k.shape)}.")
+    dtype = jnp.promote_types(c.dtype, k.dtype)
+    try:
+        shape = np.broadcast_shapes(c.shape[:-1], k.shape[:-1])
+    except ValueError as error:
+        raise ValueError(
+            f"batch axes of `coefficients` {list(c.shape)} and `zonal` {list(k.shape)} do not broadcast."
+        ) from error
+    factors = k.astype(dtype) / jnp.broadcast_to(jnp.asarray(_tables.zonal_norms(degree), dtype), k.shape)
+    factors = jnp.broadcast_to(factors[..., _tables.bands(degree)], (*shape, c.shape[-1]))
+    return jnp.broadcast_to(c.astype(dtype), factors.shape) * factors

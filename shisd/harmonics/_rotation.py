@@ -1,0 +1,138 @@
+"""Rotation of expansions by matrices: (R f)(w) = f(R^T w).
+
+A rotation is a turn about z, one about y, one about z; the turn about y is one about z between two exchanges of y and z.
+On coefficients, turns about z mix m with -m and the exchange is the constant matrix J_l of each band ("Z J Z J Z").
+The angles enter only through their cosines and sines and never leave this file. They are not smooth where the pole
+stays in place, but the result is: its derivative is taken from the generators of rotation, which need no angle.
+
+notation: R = Rz(a) Ry(b) Rz(g); c = coefficients; J_l = `_tables.swap_matrices`.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jax.typing import ArrayLike
+
+from shisd import _checks
+from shisd._numerics import angle_multiples
+from shisd._typing import Array, Float
+from shisd.harmonics import _tables
+
+
+def rotate(coefficients: ArrayLike, rotation: ArrayLike) -> Float[Array, "*batch n"]:
+    """Coefficients of the rotated expansion (R f)(w) = f(R^T w).
+
+    Arguments: `coefficients` [..., (L+1)^2]; `rotation` [3, 3], orthonormal with determinant +1 (a matrix that is not, by
+    more than 1e-3, raises; batch it with jax.vmap).
+    Derivatives: in both arguments, every order, both modes, exact at the identity and wherever the pole stays in place.
+    In `rotation` they are taken along the group of rotations: the part of a tangent that leaves it has no effect.
+    Accuracy: 1e-12 at degree 100 in float64, 1e-5 in float32, relative to the largest coefficient of the band.
+    Cost: two products with constant matrices of each band.
+    Source: Z J Z J Z with J after Pinchon and Hoggan 2007; convention of ISD15 Eq. 1.
+    """
+    c, degree = _checks.coefficients("coefficients", coefficients)
+    r = _checks.matrix("rotation", rotation)
+    dtype = jnp.promote_types(c.dtype, r.dtype)
+    return _rotate(c.astype(dtype), r.astype(dtype), degree)
+
+
+@eqx.filter_jit
+def _rotate(c: Float[Array, "*batch n"], r: Float[Array, "3 3"], degree: int) -> Float[Array, "*batch n"]:
+    drift = jnp.abs(r.T @ r - jnp.eye(3, dtype=r.dtype))
+    handed = jnp.dot(jnp.cross(r[:, 0], r[:, 1]), r[:, 2])
+    bad = ~(jnp.all(drift < 1e-3) & (handed > 0))
+    r = eqx.error_if(r, bad, "`rotation` must be orthonormal with determinant +1 (R^T R = 1, right-handed).")
+    return rotate_many(c.reshape(-1, c.shape[-1]), r[None], degree)[..., 0].reshape(c.shape)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def rotate_many(c: Float[Array, "f n"], r: Float[Array, "p 3 3"], degree: int) -> Float[Array, "f n p"]:
+    """Every expansion rotated by every matrix, without a check. Rotations stand last: they are the vector lanes."""
+    a, b, g = _turns(r, degree)
+    return _finish(_swap_turned(c, *g, degree), a, b, degree)
+
+
+def _rotate_many_jvp(degree, primals, tangents):
+    (c, r), (dc, dr) = primals, tangents
+    x = rotate_many(c, r, degree)
+    dx = jnp.zeros_like(x)
+    if not isinstance(dc, SymbolicZero):
+        dx += _rotate_many_away_from_pole(dc, r, degree)
+    if not isinstance(dr, SymbolicZero):
+        rate = jnp.einsum("pij,pkj->pik", dr, r)  # dR R^T, whose skew part is the rate of rotation in the target frame
+        rates = (rate[:, 2, 1] - rate[:, 1, 2], rate[:, 0, 2] - rate[:, 2, 0], rate[:, 1, 0] - rate[:, 0, 1])
+        for w, terms in zip(rates, _tables.generator_gather(degree), strict=True):
+            for index, factor in terms:
+                dx += jnp.asarray(factor[:, None], x.dtype)[None] * (w / 2)[None, None] * x[:, index]
+    return x, dx
+
+
+rotate_many.defjvp(_rotate_many_jvp, symbolic_zeros=True)
+
+
+def _rotate_many_away_from_pole(c: Float[Array, "f n"], r: Float[Array, "p 3 3"], degree: int) -> Array:
+    """`rotate_many` with smooth angles: linear in c, so its transpose is differentiated as it stands.
+
+    Where R nearly keeps the z axis, R = (R Q^T) Q with the quarter turn Q about x; R Q^T takes z far from z.
+    """
+    quarter = jnp.asarray([[1, 0, 0], [0, 0, -1], [0, 1, 0]], r.dtype)
+    near = r[:, 2, 2] ** 2 > 0.5
+    a, b, g = _turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
+    flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[None], c.dtype)
+    quartered = _swap(c[..., None], degree)[..., 0] * flip
+    x = jnp.where(near[None, None], _swap_turned(quartered, *g, degree), _swap_turned(c, *g, degree))
+    return _finish(x, a, b, degree)
+
+
+def _turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
+    """Cosines and sines [L+1, p] of the multiples of the three angles of each rotation."""
+    return [[p.T for p in angle_multiples(cos, sin, degree + 1)] for cos, sin in _angles(r)]
+
+
+def _finish(x: Float[Array, "f n p"], a: list[Array], b: list[Array], degree: int) -> Float[Array, "f n p"]:
+    """Z(a) J Z(-b) of x: the turn about y is J Z(-b) J, whose first exchange is already in x."""
+    cos_b, sin_b = b
+    return _turn(_swap(_turn(x, cos_b, -sin_b, degree), degree), *a, degree)
+
+
+def _angles(r: Float[Array, "p 3 3"]) -> tuple[tuple[Array, Array], tuple[Array, Array], tuple[Array, Array]]:
+    """(cos, sin) of a, b, g. Where R leaves the z axis in place, a = 0 and g is the whole turn."""
+    sin_b = jnp.sqrt(r[:, 0, 2] ** 2 + r[:, 1, 2] ** 2)
+    safe = jnp.where(sin_b > 0, sin_b, 1)
+    cos_a, sin_a = jnp.where(sin_b > 0, r[:, 0, 2] / safe, 1), r[:, 1, 2] / safe
+    cos_b = r[:, 2, 2]
+    x, y = cos_a * r[:, 0, 0] + sin_a * r[:, 1, 0], cos_a * r[:, 1, 0] - sin_a * r[:, 0, 0]
+    return (cos_a, sin_a), (cos_b, sin_b), (cos_b * x - sin_b * r[:, 2, 0], y)
+
+
+def _turn(x: Float[Array, "f n p"], cos: Array, sin: Array, degree: int) -> Float[Array, "f n p"]:
+    """The turn about z whose multiples have these cosines and sines [L+1, p]."""
+    m, l = _tables.orders(degree), _tables.bands(degree)
+    sign = jnp.asarray(-np.sign(m)[:, None], x.dtype)
+    return cos[np.abs(m)][None] * x + (sign * sin[np.abs(m)])[None] * x[:, l * l + l - m]
+
+
+def _swap(x: Float[Array, "f n p"], degree: int) -> Float[Array, "f n p"]:
+    """y and z exchanged: J_l on every band."""
+    bands = [
+        jnp.einsum("ij,fjp->fip", jnp.asarray(j, x.dtype), x[:, l * l : (l + 1) ** 2])
+        for l, j in enumerate(_tables.swap_matrices(degree))
+    ]
+    return jnp.concatenate(bands, axis=1)
+
+
+def _swap_turned(c: Float[Array, "f n"], cos: Array, sin: Array, degree: int) -> Float[Array, "f n p"]:
+    """`_swap` of `_turn` of coefficients that all rotations share: one product with the cosines and sines."""
+    cosine, sine = [], []
+    for l, j in enumerate(_tables.swap_matrices(degree)):
+        plus, minus = c[:, None, l * l + l : (l + 1) ** 2], c[:, None, l * l : l * l + l + 1][..., ::-1]
+        j_plus = jnp.asarray(j[None, :, l:], c.dtype)
+        j_minus = jnp.asarray(j[None, :, l::-1] * (np.arange(l + 1) > 0), c.dtype)  # m = 0 counts once
+        pad = ((0, 0), (0, 0), (0, degree - l))
+        cosine.append(jnp.pad(j_plus * plus + j_minus * minus, pad))
+        sine.append(jnp.pad(j_minus * plus - j_plus * minus, pad))
+    return jnp.concatenate(cosine, axis=1) @ cos + jnp.concatenate(sine, axis=1) @ sin

@@ -1,0 +1,215 @@
+"""Transforms between spherical functions on a grid of rows and columns and their spherical-harmonic coefficients.
+
+Follows the separation of variables of every fast transform: Fourier series along each row, then one sum over the rows
+for each order m. The second step differs: rows are first reduced to their Fourier series in the polar angle, one matrix
+product, since the normalised associated Legendre functions are short series there too (`_tables.polar_series`). The
+tables then no longer grow with the number of rows, and the product is not bound by memory: on 512 x 1024 texels 1.5
+times as fast as sums with the Legendre functions of each row at degree 64, and 4 times at degree 128.
+
+Rows are symmetric about the equator, and so is each function, with the sign (-1)^(l+m): sums and differences of
+mirrored rows halve the work again.
+
+notation: rows j, columns c, order m = 2 h + q, degree l = 2 i + p, Fourier index in the polar angle 2 k + p (it has the
+parity of l), r = 0 for cos(m phi) and 1 for sin(m phi), f = one of several functions.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+
+from shisd import _checks
+from shisd._typing import Array, Float
+from shisd.harmonics import _quadrature, _tables
+
+Rows = Literal["gauss", "fejer"]
+
+
+def project_map(texels: ArrayLike, degree: int) -> Float[Array, "*colour n"]:
+    """Spherical-harmonic coefficients of an equirectangular map.
+
+    Arguments: `texels` [H, W, *colour], pixel-centred: row j at theta = pi (j + 1/2)/H (row 0 next to +z), column i at
+    phi = 2 pi (i + 1/2)/W from +x towards +y; static `degree` L < min(H, W/2). Returns [*colour, (L+1)^2] in the dtype
+    of `texels`. A texel that is not finite makes every coefficient of its colour NaN: clean the map first.
+    Exact for a map band-limited to degree M when L + M < H and L + M < W; rows are weighted by Fejér's first rule.
+    Derivatives: linear in `texels`.
+    Accuracy: 3e-14 of the largest coefficient at degree 128 in float64, 3e-7 in float32.
+    Cost: 512 x 1024 at degree 16, 64, 128: 0.5, 0.6, 0.4 times ducc0 on the same cores.
+    """
+    texels, degree = _checks.real_array("texels", texels), _checks.degree(degree)
+    if texels.ndim < 2 or 0 in texels.shape:
+        raise ValueError(f"`texels` must have shape [H, W, *colour]; got {list(texels.shape)}.")
+    height, width = texels.shape[:2]
+    largest = min(height - 1, (width - 1) // 2)
+    if degree > largest:
+        raise ValueError(f"`degree` {degree} is too high for {height} x {width} texels; pass {largest} or less.")
+    coefficients = analyse(texels.reshape(height, width, -1), "fejer", degree)
+    return coefficients.reshape(*texels.shape[2:], -1)
+
+
+def project(
+    function: Callable[[Array], ArrayLike], degree: int, *, quadrature_degree: int | None = None
+) -> Float[Array, "*colour n"]:
+    """Spherical-harmonic coefficients of a function of direction.
+
+    Arguments: `function` maps unit directions [N, 3], in JAX's default float, to values [N] or [N, *colour]; static
+    `degree` L. Returns [*colour, (L+1)^2] in the dtype of the values.
+    `quadrature_degree` >= 2 L, the degree of the product rule, is 2 L unless given: exact for functions band-limited to
+    L. Raise it for rough functions: what lies above degree `quadrature_degree` - L is aliased into the result.
+    Derivatives: in whatever `function` is differentiable in, through its values.
+    Cost: (quadrature_degree + 1)^2 / 2 directions.
+    """
+    degree = _checks.degree(degree)
+    rule_degree = 2 * degree if quadrature_degree is None else _checks.integer("quadrature_degree", quadrature_degree)
+    if rule_degree < 2 * degree:
+        raise ValueError(f"`quadrature_degree` must be >= 2 * degree = {2 * degree}; got {rule_degree}.")
+    directions, _ = _quadrature.sphere_rule(rule_degree)
+    values = _checks.real_array("function(directions)", function(directions))
+    if values.ndim == 0 or values.shape[0] != directions.shape[0]:
+        raise ValueError(
+            f"`function` must return [{directions.shape[0]}, *colour] for as many directions; got {list(values.shape)}."
+        )
+    grid = values.reshape(rule_degree // 2 + 1, rule_degree + 1, -1)
+    return analyse(grid, "gauss", degree).reshape(*values.shape[1:], -1)
+
+
+def synthesize_map(coefficients: ArrayLike, height: int, width: int | None = None) -> Float[Array, "h w *colour"]:
+    """The equirectangular map of an expansion: its values at the texel centres of `project_map`, whose inverse it is.
+
+    Arguments: `coefficients` [*colour, (L+1)^2]; static `height` and `width`, 2 * height unless given, at any size.
+    Returns [height, width, *colour].
+    Derivatives: linear in `coefficients`.
+    """
+    c, _ = _checks.coefficients("coefficients", coefficients)
+    height = _checks.integer("height", height, minimum=1)
+    width = 2 * height if width is None else _checks.integer("width", width, minimum=1)
+    values = synthesize(c.reshape(-1, c.shape[-1]), "fejer", height, width)
+    return values.reshape(height, width, *c.shape[:-1])
+
+
+def analyse(values: Float[Array, "rows columns f"], rule: Rows, degree: int) -> Float[Array, "f n"]:
+    """Coefficients of functions on a grid: rows of the rule, columns at the azimuths 2 pi (i + 1/2) / columns."""
+    rows, columns = values.shape[:2]
+    tables = (
+        _azimuth_table(columns, degree, values.dtype),
+        _row_table(rule, rows, degree, values.dtype, columns),
+        _series_table(degree, values.dtype),
+    )
+    return _analyse(values, *tables, degree)
+
+
+def synthesize(c: Float[Array, "f n"], rule: Rows, rows: int, columns: int) -> Float[Array, "{rows} {columns} f"]:
+    """Values of expansions on a grid: the same rows and columns."""
+    _, degree = _checks.coefficients("coefficients", c)
+    tables = (
+        _azimuth_table(columns, degree, c.dtype),
+        _row_table(rule, rows, degree, c.dtype, None),
+        _series_table(degree, c.dtype),
+    )
+    return _synthesize(c, *tables, degree, rows, columns)
+
+
+# The tables are arguments of the compiled functions, not constants in them.
+@functools.partial(jax.jit, static_argnums=4)
+def _analyse(values: Array, azimuth: Array, polar: Array, series: Array, degree: int) -> Float[Array, "f n"]:
+    rows, half = values.shape[0], polar.shape[2]
+    if jnp.iscomplexobj(azimuth):
+        bins = jnp.fft.rfft(jnp.moveaxis(values, -1, 0))[..., : azimuth.size]
+        bins = jnp.pad(bins, ((0, 0), (0, 0), (0, azimuth.size - bins.shape[-1]))) * azimuth.reshape(1, 1, -1)
+        orders = jnp.stack([bins.real, -bins.imag], axis=-1)
+    else:
+        orders = jnp.einsum("jcf,cmr->fjmr", values, azimuth)
+    north, south = orders[:, :half], orders[:, rows - half :][:, ::-1]
+    folded = jnp.stack([north + south, north - south]).reshape(2, -1, half, series.shape[2], 2, 2)  # even, odd in z
+    even, odd = folded[..., 0, :], folded[..., 1, :]  # of the orders
+    paired = jnp.stack([jnp.stack([even[0], odd[1]]), jnp.stack([even[1], odd[0]])])  # l + m even: even in z
+    waves = jnp.einsum("pqjk,pqfjhr->pqhkfr", polar, paired)
+    blocks = jnp.einsum("pqhik,pqhkfr->fpqhir", series, waves)
+    return blocks.reshape(blocks.shape[0], -1)[:, _block_index(degree)]
+
+
+@functools.partial(jax.jit, static_argnums=(4, 5, 6))
+def _synthesize(
+    c: Array, azimuth: Array, polar: Array, series: Array, degree: int, rows: int, columns: int
+) -> Float[Array, "rows columns f"]:
+    n = degree // 2 + 1
+    source = np.full(8 * n**2, c.shape[-1])
+    source[_block_index(degree)] = np.arange(c.shape[-1])
+    blocks = jnp.pad(c, ((0, 0), (0, 1)))[:, source].reshape(-1, 2, 2, n, n, 2)
+    waves = jnp.einsum("pqhik,fpqhir->pqhkfr", series, blocks)
+    paired = jnp.einsum("pqjk,pqhkfr->pqfjhr", polar, waves)
+    even = jnp.stack([paired[0, 0], paired[1, 1]], axis=-2)  # in z, by the parity q of the order
+    odd = jnp.stack([paired[1, 0], paired[0, 1]], axis=-2)
+    orders = jnp.concatenate([even + odd, (even - odd)[:, : rows // 2][:, ::-1]], axis=1)
+    orders = orders.reshape(c.shape[0], rows, 2 * n, 2)
+    if not jnp.iscomplexobj(azimuth):
+        return jnp.einsum("fjmr,cmr->jcf", orders, azimuth)
+    halves = jnp.where(np.arange(2 * n) == 0, columns, columns / 2).astype(azimuth.dtype)
+    bins = jax.lax.complex(orders[..., 0], -orders[..., 1]) * (halves * jnp.conj(azimuth)).reshape(1, 1, -1)
+    return jnp.moveaxis(jnp.fft.irfft(bins[..., : degree + 1], n=columns), 0, -1)
+
+
+@functools.cache
+def _azimuth_table(columns: int, degree: int, dtype: DTypeLike) -> np.ndarray:
+    """cos and sin(m phi) at the columns [c, m, r], times sqrt(2) for m > 0; or the phases [m] of a Fourier transform.
+
+    Few orders or few columns: a matrix product is faster than the transform.
+    """
+    m = np.arange(2 * (degree // 2 + 1))
+    norms = np.where(m == 0, 1, np.sqrt(2))
+    if columns > max(256, 2 * degree) and degree > 32:
+        return _round(norms * np.exp(-1j * np.pi * m / columns), np.result_type(dtype, np.complex64))
+    m_phi = np.outer(_quadrature.azimuths(columns), m)
+    return _round(norms[:, None] * np.stack([np.cos(m_phi), np.sin(m_phi)], axis=-1), dtype)
+
+
+@functools.cache
+def _row_table(rule: Rows, rows: int, degree: int, dtype: DTypeLike, columns: int | None) -> np.ndarray:
+    """cos(k theta) for even orders, sin(k theta) for odd ones, on the northern rows [p, q, j, k].
+
+    With the number of columns, each is multiplied by the area of its texel.
+    """
+    theta, weights = _quadrature.gauss_rows(rows) if rule == "gauss" else _quadrature.fejer_rows(rows)
+    half = (rows + 1) // 2
+    k = 2 * np.arange(degree // 2 + 1) + np.arange(2)[:, None]
+    k_theta = theta[:half, None] * k[:, None, :]
+    table = np.stack([np.cos(k_theta), np.sin(k_theta)], axis=1)
+    if columns is not None:
+        areas = weights[:half] * (2 * np.pi / columns)
+        areas[rows // 2 :] /= 2  # a row on the equator is its own mirror image and counts twice
+        table = table * areas[:, None]
+    return _round(table, dtype)
+
+
+@functools.cache
+def _series_table(degree: int, dtype: DTypeLike) -> np.ndarray:
+    """`_tables.polar_series` in blocks of equal parities [p, q, h, i, k]."""
+    n = degree // 2 + 1
+    series = np.zeros((2 * n,) * 3)
+    series[: degree + 1, : degree + 1, : degree + 1] = _tables.polar_series(degree)  # m, k, l
+    blocks = series.reshape(n, 2, n, 2, n, 2)  # h q k p i p
+    return _round(np.stack([blocks[:, :, :, p, :, p].transpose(1, 0, 3, 2) for p in (0, 1)]), dtype)
+
+
+@functools.cache
+def _block_index(degree: int) -> np.ndarray:
+    """Where the block layout [p, q, h, i, r] keeps the coefficients of index l*(l+1)+m."""
+    n = degree // 2 + 1
+    l, m = _tables.bands(degree), _tables.orders(degree)
+    place = (l % 2, np.abs(m) % 2, np.abs(m) // 2, l // 2, (m < 0).astype(int))
+    return np.ravel_multi_index(place, (2, 2, n, n, 2)).astype(np.int32)  # not int64: the same in both precisions
+
+
+def _round(table: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+    """`table` in `dtype`, at an address that JAX on a CPU uses in place rather than copy at every call."""
+    size = table.size * np.dtype(dtype).itemsize
+    memory = np.empty(size + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    rounded = memory[start : start + size].view(dtype).reshape(table.shape)
+    rounded[...] = table
+    rounded.flags.writeable = False
+    return rounded

@@ -1,0 +1,285 @@
+"""Slow, plainly right estimators with error bars, to judge the fast paths by.
+
+They share no formula with them: no harmonics, no expansion, no closed form. Radiance is the integral over the upper
+hemisphere of value_cosine(wi, wo) times the map's bilinear radiance, taken two ways: by Monte Carlo with multiple
+importance sampling (Veach 1995, balance heuristic) for whole pictures, and by a plain sum over texels for a few pixels.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from shisd import _checks
+from shisd._numerics import normalize
+from shisd._typing import Array, Float
+from shisd.models import AbstractBrdf, Environment
+
+
+class Estimate(eqx.Module):
+    """A value and one standard deviation of its own error, in the units of the value."""
+
+    value: Array
+    standard_error: Array
+
+
+def shade_environment(
+    brdf: AbstractBrdf,
+    environment: Environment,
+    normals: ArrayLike,
+    views: ArrayLike,
+    *,
+    key: Array,
+    samples: int = 1024,
+    tangents: ArrayLike | None = None,
+) -> Estimate:
+    """Radiance [N, *colour] leaving N points towards their views under a distant environment, by Monte Carlo.
+
+    Arguments: world `normals` and `views` [N, 3], made unit here, both away from the surface; `tangents` [N, 3] set the
+    local x axis of anisotropic BRDFs (made orthogonal to the normal); static `samples` per point, rounded up so that
+    they fill whole cells. A view below the horizon gives 0.
+    Method: of eight samples, six follow the map's power, one the cosine, and one GGX half vectors as wide as
+    `brdf.lobe_width`, each two to a cell of a stratified unit square. All are weighed by the balance heuristic, so the
+    result is unbiased for any BRDF.
+    Accuracy: `standard_error` is the root of sum (a - b)^2 over the pairs, unbiased in its square. Points have
+    independent errors.
+    Derivatives: none promised. Cost: N x samples evaluations of BRDF and map; memory for one tile of points.
+    """
+    samples = _checks.integer("samples", samples, minimum=1)
+    frames, local_views = _frames(normals, views, tangents, brdf)
+    count = -(-samples // 16)
+    return _monte_carlo(brdf, environment, frames, local_views, key, count)
+
+
+def shade_environment_quadrature(
+    brdf: AbstractBrdf,
+    environment: Environment,
+    normals: ArrayLike,
+    views: ArrayLike,
+    *,
+    supersampling: int = 2,
+    tangents: ArrayLike | None = None,
+) -> Array:
+    """The same radiance [N, *colour] as a sum over every texel of the map, each cut in supersampling^2 parts.
+
+    Parts have their exact solid angle and are evaluated at their middle in angle, so the error falls with the square of
+    `supersampling` once parts are finer than the lobe. No noise and no error bar: compare two settings.
+    Cost: H x W x supersampling^2 evaluations per point, one row of the map in memory at a time: for a few points.
+    """
+    supersampling = _checks.integer("supersampling", supersampling, minimum=1)
+    frames, local_views = _frames(normals, views, tangents, brdf)
+    return _quadrature(brdf, environment, frames, local_views, supersampling)
+
+
+def _frames(
+    normals: ArrayLike, views: ArrayLike, tangents: ArrayLike | None, brdf: AbstractBrdf
+) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:
+    """World-to-local rotations (rows: tangent, bitangent, normal) and local views."""
+    normal, view = _checks.vectors("normals", normals), _checks.vectors("views", views)
+    if normal.ndim != 2 or normal.shape != view.shape:
+        message = f"`normals` and `views` must both have shape [N, 3]; got {list(normal.shape)} and {list(view.shape)}."
+        raise ValueError(message)
+    normal, view = normalize(normal), normalize(view)
+    if tangents is not None:
+        tangent = _checks.vectors("tangents", tangents)
+        if tangent.shape != normal.shape:
+            raise ValueError(f"`tangents` must have the shape of `normals`, [N, 3]; got {list(tangent.shape)}.")
+        tangent = normalize(tangent - jnp.sum(tangent * normal, axis=-1, keepdims=True) * normal)
+    elif not brdf.isotropic:
+        raise ValueError("`tangents` [N, 3] are needed: this BRDF is anisotropic.")
+    else:  # any tangent will do; this one has no singular normal (Duff et al. 2017)
+        x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
+        sign = jnp.where(z < 0, -jnp.ones_like(z), jnp.ones_like(z))
+        a = -1 / (sign + z)
+        tangent = jnp.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x], axis=-1)
+    frames = jnp.stack([tangent, jnp.cross(normal, tangent), normal], axis=1)
+    return frames, jnp.sum(frames * view[:, None, :], axis=-1)
+
+
+def _times(brdf_values: Array, radiance: Array, lead: int) -> Array:
+    """Product of two arrays [*lead, *colour], either of which may lack the colour axis."""
+    ndim = max(brdf_values.ndim, radiance.ndim)
+    pad = lambda x: x.reshape(x.shape[:lead] + (1,) * (ndim - x.ndim) + x.shape[lead:])
+    return pad(brdf_values) * pad(radiance)
+
+
+def _integrand(brdf: AbstractBrdf, environment: Environment, frame: Array, wo: Array, wi: Array) -> Array:
+    """value_cosine times radiance [..., *colour] at local directions [..., 3]; 0 when the view is below the horizon."""
+    values = jax.vmap(lambda w: brdf.value_cosine(w, wo))(wi.reshape(-1, 3))
+    values = values.reshape(wi.shape[:-1] + values.shape[1:])
+    product = _times(values, environment.radiance(wi @ frame), wi.ndim - 1)
+    return jnp.where(wo[2] > 0, product, jnp.zeros_like(product))
+
+
+# ---- Monte Carlo
+
+
+@functools.cache
+def _strata(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and sizes [cells, 2] of a grid of at least `count` nearly square cells over the unit square."""
+    rows = math.isqrt(count)
+    columns = -(-count // rows)
+    corners = np.stack(np.divmod(np.arange(rows * columns), columns), axis=-1) / [rows, columns]
+    return corners, np.broadcast_to([1 / rows, 1 / columns], corners.shape)
+
+
+class _MapDensity(eqx.Module):
+    """A density on the sphere that follows a bilinear map, up to sin(theta) inside a texel: a mixture of tents.
+
+    A texel is chosen by its power, then a point of the tent-shaped weight that it has in bilinear interpolation. In the
+    plane of theta and phi the density is then the bilinear interpolant of the texels' probabilities.
+    """
+
+    row_cdf: Array  # [1, H + 1]
+    column_cdf: Array  # [H, W + 1]
+    density: Environment  # [H, W], per rad^2 of theta and phi
+
+    def sample(self, u: Array) -> Array:
+        """Directions [..., 3] from uniform numbers [..., 2]."""
+        row, down = _invert(self.row_cdf, jnp.zeros(u.shape[:-1], int), u[..., 0])
+        column, along = _invert(self.column_cdf, row, u[..., 1])
+        step = np.pi / len(self.column_cdf)
+        theta = step * (row.astype(u.dtype) + 0.5 + _tent(down))  # a theta below 0 or above pi crosses the pole
+        phi = step * (column.astype(u.dtype) + 0.5 + _tent(along))
+        return _polar(jnp.cos(theta), jnp.sin(theta), phi)
+
+    def __call__(self, directions: Array) -> Array:
+        """Density [...] in 1/sr at unit `directions` [..., 3]."""
+        sine = jnp.sqrt(directions[..., 0] ** 2 + directions[..., 1] ** 2)
+        return self.density.radiance(directions) / jnp.maximum(sine, 1e-9)
+
+
+def _map_density(environment: Environment) -> _MapDensity:
+    texels = jnp.maximum(environment.texels, 0)
+    power = texels.reshape(*texels.shape[:2], -1).mean(axis=-1)
+    solid_angles = environment.solid_angles()[:, None]
+    mass = jnp.where(jnp.sum(power) > 0, power, jnp.ones_like(power)) * solid_angles
+    rows = jnp.sum(mass, axis=1)
+    row_cdf = _cdf(rows[None])
+    column_cdf = _cdf(jnp.where(rows[:, None] > 0, mass, jnp.ones_like(mass)))
+    probability = jnp.diff(row_cdf[0])[:, None] * jnp.diff(column_cdf)  # of the rounded tables, which are sampled
+    return _MapDensity(row_cdf, column_cdf, Environment(probability / (np.pi / len(mass)) ** 2))
+
+
+def _tent(u: Array) -> Array:
+    """A point of (-1, 1) of density 1 - |t| from a uniform number."""
+    return jnp.where(u < 0.5, jnp.sqrt(2 * u) - 1, 1 - jnp.sqrt(2 * (1 - u)))
+
+
+def _cdf(mass: Array) -> Array:
+    """Cumulative sums [R, n + 1] of each row, from exactly 0 to exactly 1."""
+    total = jnp.cumsum(mass, axis=1)
+    return jnp.concatenate([jnp.zeros_like(mass[:, :1]), total / total[:, -1:]], axis=1)
+
+
+def _invert(cdf: Array, row: Array, u: Array) -> tuple[Array, Array]:
+    """The bin of cdf[row] that holds u, by bisection, and the position of u in it, from 0 to 1."""
+
+    def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        middle = (low + high) // 2
+        below = cdf[row, middle] <= u
+        return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+    bins = cdf.shape[1] - 1
+    bounds = jnp.zeros_like(row), jnp.full_like(row, bins)
+    low, high = jax.lax.fori_loop(0, math.ceil(math.log2(bins)), halve, bounds)  # a loop keeps XLA from recomputing it
+    start, stop = cdf[row, low], cdf[row, high]
+    return low, (u - start) / (stop - start)
+
+
+def _polar(cosine: Array, sine: Array, phi: Array) -> Array:
+    return jnp.stack([sine * jnp.cos(phi), sine * jnp.sin(phi), cosine], axis=-1)
+
+
+def _sample_cosine(u: Array) -> Array:
+    return _polar(jnp.sqrt(1 - u[..., 0]), jnp.sqrt(u[..., 0]), 2 * np.pi * u[..., 1])
+
+
+def _sample_ggx(u: Array, wo: Array, alpha: Array) -> Array:
+    """Mirror directions of wo [3] about half vectors of density D(h) cos h (Walter et al. 2007, Eq. 35)."""
+    tan2 = alpha**2 * u[..., 0] / (1 - u[..., 0])
+    cosine = 1 / jnp.sqrt(1 + tan2)
+    half = _polar(cosine, cosine * jnp.sqrt(tan2), 2 * np.pi * u[..., 1])
+    return 2 * (half @ wo)[..., None] * half - jnp.broadcast_to(wo, half.shape)
+
+
+def _ggx_density(wi: Array, wo: Array, alpha: Array) -> Array:
+    half = wi + jnp.broadcast_to(wo, wi.shape)
+    length = jnp.sqrt(jnp.sum(half * half, axis=-1))
+    half = half / jnp.maximum(length, 1e-6)[..., None]
+    cos2 = half[..., 2] ** 2
+    sin2 = half[..., 0] ** 2 + half[..., 1] ** 2
+    d = alpha**2 / (np.pi * (alpha**2 * cos2 + sin2) ** 2)
+    return d * jnp.abs(half[..., 2]) / (4 * jnp.maximum(jnp.abs(half @ wo), 1e-6))
+
+
+@eqx.filter_jit
+def _monte_carlo(
+    brdf: AbstractBrdf, environment: Environment, frames: Array, views: Array, key: Array, count: int
+) -> Estimate:
+    """Pairs of samples: `count` that follow the cosine, as many GGX half vectors, six times as many that follow the map."""
+    light = _map_density(environment)
+    alpha = jnp.clip(jnp.asarray(brdf.lobe_width, views.dtype), 0.01, 1.0)
+    grids = [_strata(n) for n in (6 * count, count, count)]
+    corners, widths = (jnp.asarray(np.concatenate(part)[None], views.dtype) for part in zip(*grids, strict=True))
+    cells = [len(corner) for corner, _ in grids]
+    splits = np.cumsum(cells)[:-1]
+    sizes = [2.0 * n for n in cells]
+
+    def one(point: tuple[Array, Array, Array]) -> tuple[Array, Array]:  # barriers stop XLA from repeating work
+        frame, wo, key = point
+        jitter = jax.random.uniform(key, (2, sum(cells), 2), views.dtype)  # two independent points in every cell
+        u = jax.lax.optimization_barrier(corners + widths * jitter)
+        u_light, u_cosine, u_ggx = jnp.split(u, splits, axis=1)
+        wi = [light.sample(u_light) @ frame.T, _sample_cosine(u_cosine), _sample_ggx(u_ggx, wo, alpha)]
+        wi = jax.lax.optimization_barrier(jnp.concatenate(wi, axis=1))
+        # balance heuristic: each sample is divided by the sum of (number of samples) x (density) over the strategies
+        density = sizes[0] * light(wi @ frame) + sizes[1] / np.pi * jnp.maximum(wi[..., 2], 0)
+        density += sizes[2] * _ggx_density(wi, wo, alpha)
+        inverse = jnp.where(density > 0, 1 / jnp.where(density > 0, density, jnp.ones_like(density)), 0)
+        terms = _times(inverse, _integrand(brdf, environment, frame, wo, wi), 2)
+        value = jnp.sum(terms, axis=(0, 1))
+        return value, jnp.sqrt(jnp.sum((terms[0] - terms[1]) ** 2, axis=0))
+
+    keys = jax.random.split(key, views.shape[0])
+    return Estimate(*_tiled(one, (frames, views, keys), max(1, 2**15 // (2 * sum(cells)))))
+
+
+def _tiled(function: Callable, arguments: tuple[Array, ...], size: int) -> tuple[Array, ...]:
+    """vmap in tiles of `size`, the last one filled up: one body to compile, and memory for one tile."""
+    count = arguments[0].shape[0]
+    size = max(1, min(size, count))
+    index = jnp.arange(-(-count // size) * size).reshape(-1, size) % max(1, count)
+    results = jax.lax.map(lambda i: jax.vmap(function)(tuple(a[i] for a in arguments)), index)
+    return tuple(r.reshape(-1, *r.shape[2:])[:count] for r in results)
+
+
+# ---- quadrature
+
+
+@eqx.filter_jit
+def _quadrature(brdf: AbstractBrdf, environment: Environment, frames: Array, views: Array, supersampling: int) -> Array:
+    height, width = (supersampling * n for n in environment.texels.shape[:2])
+    theta = np.pi * (np.arange(height) + 0.5) / height
+    phi = 2 * np.pi * (np.arange(width) + 0.5) / width
+    solid_angles = jnp.asarray(2 * np.pi / width * 2 * np.sin(theta) * np.sin(np.pi / height / 2), views.dtype)
+    cosines, sines = jnp.asarray(np.cos(theta), views.dtype), jnp.asarray(np.sin(theta), views.dtype)
+    circle = jnp.asarray(np.stack([np.cos(phi), np.sin(phi)], axis=-1), views.dtype)
+
+    def one(point: tuple[Array, Array]) -> Array:
+        frame, wo = point
+
+        def row(part: tuple[Array, Array, Array]) -> Array:
+            cosine, sine, solid_angle = part
+            world = jnp.concatenate([sine * circle, jnp.full_like(circle[:, :1], cosine)], axis=1)
+            return solid_angle * jnp.sum(_integrand(brdf, environment, frame, wo, world @ frame.T), axis=0)
+
+        return jnp.sum(jax.lax.map(row, (cosines, sines, solid_angles)), axis=0)
+
+    return jax.lax.map(one, (frames, views))

@@ -1,0 +1,8 @@
+"""Stage 5: radiance, from materials as lobes and light as coefficients.
+
+Directions are in world space and point away from the surface; image colour is the last axis.
+"""
+
+from shisd.shading._environment import shade_environment as shade_environment
+from shisd.shading._lobes import Lobes as Lobes
+from shisd.shading._lobes import tabulate_brdf as tabulate_brdf

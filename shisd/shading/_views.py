@@ -1,0 +1,79 @@
+"""Smooth interpolation over view directions: splines in elevation, Fourier series in azimuth.
+
+A quantity f(theta, phi) that is smooth on the hemisphere of views has Fourier components f_k(theta) in azimuth with the
+parity f_k(-theta) = (-1)^k f_k(theta), and f_k(theta) / sin(theta) is smooth for k > 0. Splines of these quotients, with
+that parity built in, times sin(theta) cos(k phi) and sin(theta) sin(k phi), have a value and a gradient at theta = 0 that
+do not depend on the azimuth chosen there. So a view along the normal is an ordinary view.
+
+notation: elevation nodes theta_j = (j + 1/2) h, j = 0 ... V-1, h = (pi/2) / V; cubic B-splines B(theta/h - 1/2 - j) with
+j = -2 ... V+1, so that every theta in [0, pi/2] sees four of them.
+"""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+
+from shisd._numerics import angle_multiples
+from shisd._typing import Array, Float
+
+
+def elevations(count: int) -> np.ndarray:
+    """The nodes theta_j, in rad; no node lies on the normal or at the horizon."""
+    return (np.arange(count) + 0.5) * (np.pi / 2 / count)
+
+
+@functools.cache
+def spline_matrices(count: int) -> np.ndarray:
+    """Spline coefficients from values at the nodes, [2, V+4, V]: for functions even, then odd, about theta = 0.
+
+    At the horizon the last coefficients continue the cubic of the last interval (not-a-knot).
+    """
+    matrices = []
+    for sign in (1.0, -1.0):
+        extend = np.zeros((count + 4, count))  # free coefficients a_0 ... a_{V-1} -> a_{-2} ... a_{V+1}
+        extend[2:-2] = np.eye(count)
+        extend[1], extend[0] = sign * extend[2], sign * extend[3]
+        for row in (count + 2, count + 3):  # fourth difference zero
+            extend[row] = 4 * extend[row - 1] - 6 * extend[row - 2] + 4 * extend[row - 3] - extend[row - 4]
+        at_nodes = (extend[1:-3] + 4 * extend[2:-2] + extend[3:-1]) / 6
+        matrices.append(extend @ np.linalg.inv(at_nodes))
+    return np.stack(matrices)
+
+
+def spline_table(values: Float[Array, "*batch orders v"], orders: np.ndarray) -> Float[Array, "*batch orders coefs"]:
+    """Spline coefficients over the last axis of components of the given azimuthal `orders` k >= 0."""
+    count = values.shape[-1]
+    quotient = np.where(orders[:, None] > 0, 1 / np.sin(elevations(count)), 1.0)
+    odd = (orders > 0) & (orders % 2 == 0)  # f_k / sin is odd for even k > 0
+    even_matrix, odd_matrix = (jnp.asarray(m.T, values.dtype) for m in spline_matrices(count))
+    scaled = values * jnp.asarray(quotient, values.dtype).reshape((1,) * (values.ndim - 2) + quotient.shape)
+    return jnp.where(jnp.broadcast_to(odd[:, None], (*scaled.shape[:-1], 1)), scaled @ odd_matrix, scaled @ even_matrix)
+
+
+def spline_weights(view: Float[Array, "p 3"], count: int) -> Float[Array, "coefs p"]:
+    """The B-splines at the elevation of each local view direction; beyond the horizon those at the horizon."""
+    sine = _sine(view)
+    theta = jnp.minimum(jnp.arctan2(sine, view[:, 2]), np.pi / 2)
+    j = jnp.arange(-2, count + 2, dtype=view.dtype)
+    t = jnp.abs(theta[None, :] * (count / (np.pi / 2)) - 0.5 - j[:, None])
+    return jnp.where(t < 1, (4 - 6 * t * t + 3 * t**3) / 6, jnp.maximum(2 - t, 0) ** 3 / 6)
+
+
+def azimuth_factors(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array, "k p"], Float[Array, "k p"]]:
+    """sin(theta) cos(k phi) and sin(theta) sin(k phi) for k = 1 ... count-1, after 1 and 0 for k = 0."""
+    x, y = view[:, 0], view[:, 1]
+    sine = _sine(view)
+    off = sine > 0
+    safe = jnp.where(off, sine, 1)
+    cos, sin = (p.T for p in angle_multiples(jnp.where(off, x / safe, 1), y / safe, max(count - 1, 1)))
+    x, y = x[None], y[None]
+    first = jnp.ones_like(x), jnp.zeros_like(x)
+    rest = (x * cos - y * sin, x * sin + y * cos)  # (x, y) = sin(theta) (cos, sin)(phi)
+    return tuple(jnp.concatenate([f, r])[:count] for f, r in zip(first, rest, strict=True))
+
+
+def _sine(view: Float[Array, "p 3"]) -> Float[Array, " p"]:
+    square = view[:, 0] ** 2 + view[:, 1] ** 2
+    off = square > 0
+    return jnp.where(off, jnp.sqrt(jnp.where(off, square, 1)), 0)

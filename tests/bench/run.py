@@ -1,0 +1,235 @@
+"""Measure speed beside error and write the tables: python -m tests.bench.run [--output DIR] [--readme] [--only NAME].
+
+Results go to DIR/bench.json and DIR/bench.md; --readme also puts the tables between the README's bench markers.
+Allocator: outputs of tens of megabytes page-fault on every call with glibc's defaults, for every method alike; `make bench`
+sets MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000. XLA flags: default.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shisd import decomposition, harmonics, models, shading
+from shisd.harmonics import _tables
+from tests.bench import equation_22
+from tests.bench.timing import interleaved
+
+POINTS = 10_000
+PIXELS = 128 * 128
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def host_basis(directions, degree):
+    """y_l^m in float64 by the recurrence on the host, as truth for float32."""
+    theta = np.arctan2(np.hypot(directions[:, 0], directions[:, 1]), directions[:, 2])
+    phi = np.arctan2(directions[:, 1], directions[:, 0])
+    p, m, l = _tables.associated_legendre(theta, degree), _tables.orders(degree), _tables.bands(degree)
+    angle = np.where(m >= 0, np.cos(np.outer(phi, m)), np.sin(np.outer(phi, -m))) * np.where(m == 0, 1, np.sqrt(2))
+    return p[l, np.abs(m)].T * angle
+
+
+def competitor(degree):
+    """sphericart for JAX where it is installed, else its NumPy interface (the same C++): values, and with gradients."""
+    try:
+        import sphericart.jax as sj
+
+        values = jax.jit(lambda d: sj.spherical_harmonics(d, degree))
+        return "sphericart-jax", values, jax.jit(jax.value_and_grad(lambda d, w: jnp.vdot(sj.spherical_harmonics(d, degree), w)))
+    except ImportError:
+        import sphericart
+
+        calculator = sphericart.SphericalHarmonics(degree)
+
+        def value_and_gradient(d, w):
+            y, dy = calculator.compute_with_gradients(np.asarray(d))
+            return np.vdot(y, w), np.einsum("pin,pn->pi", dy, w)
+
+        return "sphericart", lambda d: calculator.compute(np.asarray(d)), value_and_gradient
+
+
+def bench_basis(degrees=(4, 8, 16, 32, 64, 100)):
+    """sh_basis [10,000 points, coefficients last] in float32: time relative to sphericart, error, first call."""
+    d = unit(np.random.default_rng(0).normal(size=(POINTS, 3))).astype(np.float32)
+    rows = []
+    for degree in degrees:
+        peer, values, gradients = competitor(degree)
+        basis = jax.jit(lambda d, degree=degree: harmonics.sh_basis(d, degree))
+        truth = host_basis(d[:500].astype(float), degree)
+        signs = np.where(_tables.orders(degree) % 2, -1, 1)  # sphericart: no Condon-Shortley phase
+        times = interleaved({"ours": basis, "peer": values}, jnp.asarray(d))
+        row = {
+            "degree": degree,
+            "peer": peer,
+            "us/point": times["ours"].median / POINTS * 1e6,
+            "speed / peer": times["peer"].median / times["ours"].median,
+            "max error": float(np.max(np.abs(basis(d)[:500] - truth))),
+            "peer's max error": float(np.max(np.abs(np.asarray(values(jnp.asarray(d)))[:500] * signs - truth))),
+            "first call s": times["ours"].first,
+        }
+        if degree <= 32:
+            w = jnp.asarray(np.random.default_rng(1).normal(size=(POINTS, (degree + 1) ** 2)), jnp.float32)
+            ours = jax.jit(jax.value_and_grad(lambda d, w, degree=degree: jnp.vdot(harmonics.sh_basis(d, degree), w)))
+            times = interleaved({"ours": ours, "peer": gradients}, jnp.asarray(d), w)
+            row["with gradient / peer"] = times["peer"].median / times["ours"].median
+        rows.append(row)
+    return rows
+
+
+def bench_evaluate(degrees=(16, 32, 64)):
+    """evaluate: one expansion at 10,000 points in float32, against sphericart and a product."""
+    rng = np.random.default_rng(0)
+    d = unit(rng.normal(size=(POINTS, 3))).astype(np.float32)
+    rows = []
+    for degree in degrees:
+        c = rng.normal(size=(degree + 1) ** 2).astype(np.float32)
+        peer, values, _ = competitor(degree)
+        product = jax.jit(lambda d, values=values, c=c: values(d) @ c) if peer == "sphericart-jax" else lambda d, values=values, c=c: values(d) @ c
+        ours = jax.jit(lambda d, c=c: harmonics.evaluate(c, d))
+        times = interleaved({"ours": ours, "peer": product}, jnp.asarray(d))
+        truth = host_basis(d[:500].astype(float), degree) @ c.astype(float)
+        rows.append({
+            "degree": degree,
+            "us/point": times["ours"].median / POINTS * 1e6,
+            f"speed / {peer} and product": times["peer"].median / times["ours"].median,
+            "max error / rms": float(np.max(np.abs(ours(d)[:500] - truth)) / np.sqrt(np.mean(truth**2))),
+            "first call s": times["ours"].first,
+        })  # fmt: skip
+    return rows
+
+
+def bench_project_map(degrees=(16, 64, 128)):
+    """project_map of a 512 x 1024 map in float64, against ducc0 with two threads."""
+    import ducc0
+
+    rows = []
+    with jax.enable_x64(True):
+        for degree in degrees:
+            c = np.random.default_rng(0).normal(size=(degree + 1) ** 2)
+            texels = harmonics.synthesize_map(jnp.asarray(c), 512)
+            host = np.asarray(texels)
+            peer = lambda t, degree=degree, host=host: ducc0.sht.experimental.analysis_2d(
+                map=host[None], spin=0, lmax=degree, mmax=degree, geometry="F1", nthreads=2
+            )
+            ours = lambda t, degree=degree: harmonics.project_map(t, degree)
+            times = interleaved({"ours": ours, "peer": peer}, texels)
+            rows.append({
+                "degree": degree,
+                "ms": times["ours"].median * 1e3,
+                "time / ducc0": times["ours"].median / times["peer"].median,
+                "max error / largest": float(np.max(np.abs(np.asarray(ours(texels)) - c)) / np.max(np.abs(c))),
+                "first call s": times["ours"].first,
+            })  # fmt: skip
+    return rows
+
+
+def bench_equation_22(degrees=(4, 8, 16, 30)):
+    """Eq. 22 for 128 x 128 pixels, RGB light, isotropic GGX (alpha 0.3), float32; errors against exact slices."""
+    rng = np.random.default_rng(0)
+    normals = unit(rng.normal(size=(PIXELS, 3)))
+    views = unit(rng.normal(size=(PIXELS, 3)))
+    views *= np.sign(np.sum(normals * views, axis=1, keepdims=True))
+    normals, views = jnp.asarray(normals, jnp.float32), jnp.asarray(views, jnp.float32)
+    brdf = models.Ggx(0.3, 0.04)
+    rows = []
+    for degree in degrees:
+        basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+        lobes = shading.tabulate_brdf(brdf, basis)
+        # a light whose band energies fall like 1/(l+1)^2, as those of measured environments do
+        light = rng.normal(size=(3, (degree + 1) ** 2)) / (1 + _tables.bands(degree)) ** 1.5
+        light = jnp.asarray(light, jnp.float32)
+        candidates = equation_22.methods(lobes, light)
+        truth = equation_22.exact_slices(brdf, light, normals[:256], views[:256])
+        times = interleaved(candidates, normals, views)
+        for name, method in candidates.items():
+            error = np.asarray(method(normals, views)[:256]) - truth
+            rows.append({
+                "degree": degree,
+                "method": name,
+                "us/pixel": times[name].median / PIXELS * 1e6,
+                "speed / literal": times["literal"].median / times[name].median,
+                "relative RMSE": float(np.sqrt(np.mean(error**2) / np.mean(truth**2))),
+                "max error / max": float(np.max(np.abs(error)) / np.max(np.abs(truth))),
+                "first call s": times[name].first,
+            })  # fmt: skip
+        gradient = jax.jit(jax.grad(lambda n, v, lobes=lobes, light=light: jnp.sum(shading.shade_environment(lobes, light, n, v)), (0, 1)))
+        forward = candidates["rotated"]
+        times = interleaved({"gradient": gradient, "forward": forward}, normals, views)
+        rows[-1]["value and gradient / forward"] = times["gradient"].median / times["forward"].median
+    return rows
+
+
+def bench_memory(degree=30):
+    """Peak memory of a process that shades 1024 x 768 pixels at degree 30, RGB."""
+    command = [sys.executable, "-m", "tests.bench.run", "--memory-child", str(degree)]
+    child = subprocess.run(command, capture_output=True, text=True, check=True)
+    return [{"degree": degree, "pixels": 1024 * 768, **json.loads(child.stdout.splitlines()[-1])}]
+
+
+def memory_child(degree):
+    rng = np.random.default_rng(0)
+    peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    normals = unit(rng.normal(size=(1024 * 768, 3))).astype(np.float32)
+    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+    lobes = shading.tabulate_brdf(models.Ggx(0.3), basis)
+    light = rng.normal(size=(3, (degree + 1) ** 2)).astype(np.float32)
+    before = peak()
+    jax.block_until_ready(shading.shade_environment(lobes, light, normals, normals))
+    print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
+
+
+BENCHES = {
+    "basis": bench_basis,
+    "evaluate": bench_evaluate,
+    "project_map": bench_project_map,
+    "equation_22": bench_equation_22,
+    "memory": bench_memory,
+}
+
+
+def table(rows):
+    """A Markdown table; columns that only some rows have are left empty in the others."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    show = lambda x: "" if x is None else f"{x:.2g}" if isinstance(x, float) and not 0.1 <= abs(x) < 1000 else f"{x:.2f}" if isinstance(x, float) else str(x)
+    lines = [columns, ["---"] * len(columns), *([show(row.get(c)) for c in columns] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", type=Path, default=Path("output/bench"))
+    parser.add_argument("--only", choices=BENCHES, action="append")
+    parser.add_argument("--readme", action="store_true", help="put the tables into README.md")
+    parser.add_argument("--memory-child", type=int, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.memory_child is not None:
+        return memory_child(arguments.memory_child)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    results, sections = {}, []
+    for name in arguments.only or BENCHES:
+        results[name] = BENCHES[name]()
+        sections.append(f"{BENCHES[name].__doc__}\n\n{table(results[name])}")
+        print(sections[-1], "\n", flush=True)
+    tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
+    note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {'tuned' if tuned else 'default'} allocator."
+    text = "\n\n".join([*sections, note])
+    (arguments.output / "bench.json").write_text(json.dumps(results, indent=1))
+    (arguments.output / "bench.md").write_text(text + "\n")
+    if arguments.readme:
+        readme = Path("README.md")
+        before, rest = readme.read_text().split("<!-- table:bench -->")
+        readme.write_text(f"{before}<!-- table:bench -->\n{text}\n<!-- /table -->{rest.split('<!-- /table -->', 1)[1]}")
+
+
+if __name__ == "__main__":
+    main()

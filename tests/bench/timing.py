@@ -1,0 +1,36 @@
+"""Interleaved timing: what is compared runs in turn, so a machine that speeds up or slows down does so for all."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+
+@dataclass
+class Timing:
+    first: float  # s, the first call: tracing and compiling included
+    median: float  # s
+    best: float  # s
+
+
+def interleaved(methods: dict[str, Callable], *arguments, seconds: float = 2.0, rounds: int = 30) -> dict[str, Timing]:
+    """Call every method once, then all of them in turn until the time is used up; at least five rounds."""
+    first, runs = {}, {name: [] for name in methods}
+    for name, method in methods.items():
+        first[name] = _time(method, arguments)
+        _time(method, arguments)
+    start = time.perf_counter()
+    for i in range(rounds):
+        if i >= 5 and time.perf_counter() - start > seconds * len(methods):
+            break
+        for name, method in methods.items():
+            runs[name].append(_time(method, arguments))
+    return {name: Timing(first[name], float(np.median(t)), float(np.min(t))) for name, t in runs.items()}
+
+
+def _time(method: Callable, arguments: tuple) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(method(*arguments))
+    return time.perf_counter() - start

@@ -1,0 +1,226 @@
+"""Sets of axes: shapes, spread, determinism, the shipped table and the optimiser."""
+
+import importlib.util
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from shisd import decomposition
+from tests.decomposition import truth
+
+SETS = {
+    "fibonacci": decomposition.fibonacci_directions,
+    "low_discrepancy": decomposition.low_discrepancy_directions,
+    "random": lambda count: decomposition.random_directions(count, jax.random.key(7)),
+}
+
+
+def smallest_angle(z):
+    """Between axes, so z and -z count as equal."""
+    cosines = np.abs(np.asarray(z, np.float64) @ np.asarray(z, np.float64).T)
+    return np.arccos(np.clip(cosines - 2 * np.eye(len(z)), -1, 1).max())
+
+
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("count", [1, 2, 9, 61])
+def test_sets_are_unit_axes_of_the_upper_hemisphere(name, count, dtype):
+    z = SETS[name](count)
+    assert z.shape == (count, 3) and z.dtype == dtype
+    assert np.all(np.asarray(z)[:, 2] >= 0)
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(z), axis=1), 1, atol=4 * np.finfo(dtype).eps)
+    np.testing.assert_array_equal(z, SETS[name](count))
+
+
+@pytest.mark.parametrize("name", ["fibonacci", "low_discrepancy"])
+def test_spread_sets_keep_a_distance(name):
+    for count in (5, 17, 61):
+        assert smallest_angle(SETS[name](count)) > 0.2 * np.sqrt(2 * np.pi / count)
+
+
+def test_mean_square_of_every_coordinate_is_a_third():
+    for make, tolerance in ((SETS["fibonacci"], 2e-3), (SETS["low_discrepancy"], 1e-2), (SETS["random"], 3e-2)):
+        np.testing.assert_allclose(np.mean(np.asarray(make(1000)) ** 2, axis=0), 1 / 3, atol=tolerance)
+
+
+def test_longer_low_discrepancy_sets_begin_with_shorter_ones():
+    z = decomposition.low_discrepancy_directions(40)
+    np.testing.assert_array_equal(z[:13], decomposition.low_discrepancy_directions(13))
+
+
+def test_the_dtype_can_be_chosen(x64):
+    for z in (
+        decomposition.fibonacci_directions(5, dtype=jnp.float32),
+        decomposition.low_discrepancy_directions(5, dtype=jnp.float32),
+        decomposition.random_directions(5, jax.random.key(0), dtype=jnp.float32),
+        decomposition.optimized_directions(2, dtype=jnp.float32),
+    ):
+        assert z.dtype == jnp.float32 and z.shape == (5, 3)
+
+
+def fibonacci_points(count):
+    """The usual spiral over the whole sphere."""
+    i = np.arange(count)
+    z, phi = 1 - (2 * i + 1) / count, i * np.pi * (np.sqrt(5) - 1)
+    return np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
+
+
+@pytest.mark.parametrize("degree", range(1, 21))
+def test_fibonacci_points_are_singular_in_odd_bands_and_fibonacci_axes_are_not(degree):
+    # 2L+1 points map to themselves under the half-turn about the middle point, so they give L+1 symmetric sums of
+    # lobes; band L has L+1 symmetric functions if L is even, but only L if L is odd.
+    points = fibonacci_points(2 * degree + 1)
+    middle = points[degree]
+    half_turn = 2 * np.outer(middle, middle) - np.eye(3)
+    np.testing.assert_allclose(points @ half_turn, points[::-1], atol=1e-12)
+    singular = truth.conditions(points, degree)[degree] > 1e12
+    assert singular == (degree % 2 == 1)
+    assert truth.conditions(decomposition.fibonacci_directions(2 * degree + 1), degree).max() < 100
+
+
+# --- the shipped table ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", range(33))
+def test_table_is_as_well_conditioned_as_documented(degree, x64):
+    z = np.asarray(decomposition.optimized_directions(degree))
+    assert z.shape == (2 * degree + 1, 3) and np.all(z[:, 2] >= 0)
+    np.testing.assert_allclose(np.linalg.norm(z, axis=1), 1, atol=1e-15)
+    assert degree == 0 or smallest_angle(z) > 0.5 * np.sqrt(2 * np.pi / len(z))
+    conditions = truth.conditions(z, degree)
+    assert conditions.max() <= {4: 2.30, 8: 2.95, 12: 4.40, 20: 6.50}.get(degree, 1.9 + 0.24 * degree)
+    ours = decomposition.RotatedZonalBasis(z, degree).condition_numbers()
+    np.testing.assert_allclose(ours, conditions, rtol=1e-10)
+
+
+def test_table_records_its_conditions():
+    file = Path(decomposition.__file__).parent / "data" / "optimized_directions.npz"
+    assert file.stat().st_size < 40_000
+    with np.load(file) as data:
+        assert data["directions"].shape == (33**2, 3) and data["directions"].dtype == np.float64
+        for degree in (1, 8, 20, 32):
+            z = data["directions"][degree**2 : (degree + 1) ** 2]
+            np.testing.assert_allclose(data["conditions"][degree], truth.conditions(z, degree).max(), rtol=1e-9)
+
+
+def test_prefixes_of_the_table_serve_single_bands():
+    for degree in range(33):
+        z = decomposition.optimized_directions(degree)
+        assert truth.conditions(z, degree, nested=True).max() < 190, degree
+
+
+def test_float32_rounding_does_not_spoil_the_table():
+    z = decomposition.optimized_directions(20)
+    assert z.dtype == jnp.float32
+    basis = decomposition.RotatedZonalBasis(z, 20)
+    np.testing.assert_allclose(basis.condition_numbers(), truth.conditions(z, 20), rtol=1e-4)
+
+
+# --- the optimiser ----------------------------------------------------------------------------------------------------
+
+
+def independent_loss(z, degree, power):
+    total = 0.0
+    for l, m in enumerate(truth.matrices(z, degree)):
+        mu = np.linalg.svd(m, compute_uv=False) ** 2 * (2 * l + 1) / len(z)
+        total += np.sum(mu**power) * np.sum(mu**-power)
+    return np.log(total) / (2 * power)
+
+
+@pytest.mark.parametrize("degree, count", [(0, 1), (1, 3), (3, 7), (3, 10), (6, 13)])
+@pytest.mark.parametrize("power", [1.0, 3.0, 8.0])
+def test_loss_agrees_with_singular_values_and_bounds_the_condition(degree, count, power, x64):
+    z = decomposition.low_discrepancy_directions(count)
+    loss = decomposition.conditioning_loss(z, degree, power=power)
+    np.testing.assert_allclose(loss, independent_loss(z, degree, power), rtol=1e-10, atol=1e-12)
+    excess = float(loss) - np.log(truth.conditions(z, degree).max())
+    assert -1e-12 <= excess <= np.log((2 * degree + 1) * np.sqrt(degree + 1)) / power
+
+
+def test_gradient_of_the_loss_matches_finite_differences(x64, rng):
+    z = decomposition.fibonacci_directions(9)
+    gradient = jax.grad(decomposition.conditioning_loss)(z, 4)
+    for _ in range(4):
+        step = 1e-5 * rng.standard_normal(z.shape)
+        difference = independent_loss(z + step, 4, 8.0) - independent_loss(z - step, 4, 8.0)
+        np.testing.assert_allclose(np.sum(gradient * step), difference / 2, rtol=1e-6)
+    jax.test_util.check_grads(lambda z: decomposition.conditioning_loss(z, 4), (z,), order=1, modes=("fwd", "rev"))
+
+
+def test_gradient_of_the_loss_is_right_where_eigenvalues_meet(x64):
+    # the axes of a cube's faces: band 1 has three equal eigenvalues and is best possible, so the gradient is zero
+    z = jnp.eye(3)
+    np.testing.assert_allclose(decomposition.conditioning_loss(z, 1, power=3.0), np.log(1 + 9) / 6, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(decomposition.conditioning_loss)(z, 1), np.zeros((3, 3)), atol=1e-12)
+
+
+def test_optimizer_improves_a_random_start_and_is_deterministic(dtype):
+    start = decomposition.random_directions(9, jax.random.key(3))
+    found = decomposition.optimize_directions(start, 4)
+    assert found.shape == (9, 3) and found.dtype == dtype
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(found), axis=1), 1, atol=4 * np.finfo(dtype).eps)
+    before, after = (truth.conditions(z, 4).max() for z in (start, found))
+    assert after < 3.5 < before
+    np.testing.assert_array_equal(found, decomposition.optimize_directions(start, 4))
+
+
+def test_optimizer_takes_more_axes_than_needed(x64):
+    start = decomposition.fibonacci_directions(14)
+    found = decomposition.optimize_directions(start, 4, powers=(1.0, 8.0), max_steps=100)
+    assert truth.conditions(found, 4).max() < min(1.5, truth.conditions(start, 4).max())
+
+
+def test_optimizer_returns_a_singular_start_as_it_is(x64):
+    start = jnp.asarray(fibonacci_points(3) * [1.0, 1.0, 0.0] + [1e-3, 0, 0])
+    start = start.at[:, 2].set(0.0)  # all in a plane
+    found = decomposition.optimize_directions(start, 1)
+    assert np.all(np.isfinite(np.asarray(found)))
+
+
+@pytest.mark.slow
+def test_table_script_refuses_to_overwrite_and_makes_a_table(tmp_path, monkeypatch, x64):
+    path = Path(__file__).parents[1] / "bench" / "make_directions.py"
+    spec = importlib.util.spec_from_file_location("make_directions", path)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    monkeypatch.setattr("sys.argv", ["make_directions.py"])
+    with pytest.raises(SystemExit, match="exists; pass --overwrite"):
+        script.main()
+    output = tmp_path / "table.npz"
+    arguments = ["--output", str(output), "--degrees", "0", "1", "--effort", "0.02"]
+    monkeypatch.setattr("sys.argv", ["make_directions.py", *arguments])
+    script.main()
+    with np.load(output) as data:
+        np.testing.assert_allclose(data["conditions"][:2], 1, rtol=1e-6)
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [*SETS.values()], ids=[*SETS])
+def test_bad_counts_are_refused(make, as_user):
+    with pytest.raises(ValueError, match="`count` must be >= 1; got 0"):
+        make(0)
+    with pytest.raises(ValueError, match="`count` must be a Python integer"):
+        make(2.5)
+
+
+def test_the_table_says_what_to_use_beyond_its_end(as_user):
+    with pytest.raises(ValueError, match=r"`degree` must be <= 32.*got 33.*fibonacci_directions\(67\)"):
+        decomposition.optimized_directions(33)
+    with pytest.raises(ValueError, match="`degree` must be >= 0; got -1"):
+        decomposition.optimized_directions(-1)
+    with pytest.raises(ValueError, match="`degree` must be a Python integer"):
+        decomposition.optimized_directions(2.0)
+
+
+@pytest.mark.parametrize("function", [decomposition.optimize_directions, decomposition.conditioning_loss])
+def test_optimizer_and_loss_refuse_bad_shapes(function, as_user):
+    with pytest.raises(ValueError, match=r"at least 2\*degree \+ 1 = 9 axes for degree 4; got 8"):
+        function(decomposition.fibonacci_directions(8), 4)
+    with pytest.raises(ValueError, match=r"must have shape \[\.\.\., 3\]"):
+        function(jnp.ones((5, 2)), 1)
+    with pytest.raises(ValueError, match=r"must have shape \[K, 3\]; got \[2, 5, 3\]"):
+        function(jnp.ones((2, 5, 3)), 1)

@@ -1,0 +1,272 @@
+"""ISD15 Eq. 22 against its own literal form, against quadrature, and in its derivatives."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.special import sph_harm_y
+
+from shisd import decomposition, harmonics, models, shading
+
+DEGREE = 6
+COUNT = 1000
+DOUBLE = np.dtype("float64")
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def scene(rng, count, dtype, colour=(3,)):
+    """Random light, normals and views above the horizon, tangents."""
+    normals, tangents = unit(rng.normal(size=(count, 3))), unit(rng.normal(size=(count, 3)))
+    views = unit(rng.normal(size=(count, 3)))
+    views *= np.where(np.sum(views * normals, axis=1) < 0, -1, 1)[:, None]
+    light = rng.normal(size=(*colour, (DEGREE + 1) ** 2))
+    return tuple(a.astype(dtype) for a in (light, normals, views, tangents))
+
+
+def tabulate(brdf, **options):
+    basis = decomposition.RotatedZonalBasis(decomposition.fibonacci_directions(2 * DEGREE + 1), DEGREE)
+    return shading.tabulate_brdf(brdf, basis, views=16, azimuths=8, **options)
+
+
+@functools.cache
+def lobes_of(material, dtype=np.dtype("float32")):
+    """Tabulated once per precision; called with x64 switched as the dtype says."""
+    return tabulate(MATERIALS[material]())
+
+
+def real_sh(directions, degree):
+    """SciPy's harmonics in our convention."""
+    theta = np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), directions[..., 2])
+    phi = np.arctan2(directions[..., 1], directions[..., 0])
+    columns = []
+    for l in range(degree + 1):
+        for m in range(-l, l + 1):
+            y = sph_harm_y(l, abs(m), theta, phi)
+            columns.append(y.real if m == 0 else np.sqrt(2) * (y.real if m > 0 else y.imag))
+    return np.stack(columns, axis=-1)
+
+
+def any_frame(normal):
+    """Columns t, b, n: a frame of another make than the library's."""
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    t = unit(np.cross(helper, normal))
+    return np.stack([t, np.cross(normal, t), normal], axis=-1)
+
+
+def equation_22(lobes, weights, light, rotation):
+    """sum over l, k of pi_l lambda_l^k sum over m of e_l^m y_l^m(R z_k), with SciPy's harmonics, in float64."""
+    axes = np.asarray(lobes.basis.directions, float) @ rotation.T
+    y = real_sh(axes, DEGREE)
+    total = 0.0
+    for l in range(DEGREE + 1):
+        band = slice(l * l, (l + 1) ** 2)
+        total = total + np.sqrt(4 * np.pi / (2 * l + 1)) * np.sum(weights[..., l, :] * (light[..., band] @ y[:, band].T), -1)
+    return total
+
+
+MATERIALS = {
+    "diffuse": lambda: models.Lambertian([0.2, 0.5, 0.8]),
+    "glossy": lambda: models.Ggx(0.4, 0.3),
+    "brushed": lambda: models.Ggx([0.3, 0.6], [0.9, 0.6, 0.3]),
+}
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_radiance_is_equation_22(material, dtype, rng):
+    lobes = lobes_of(material, dtype)
+    light, normals, views, tangents = scene(rng, COUNT, dtype)
+    got = shading.shade_environment(lobes, light, normals, views, tangents)
+    assert got.shape == (COUNT, 3) and got.dtype == dtype
+    frames = []
+    for normal, tangent in zip(*(unit(a[:100].astype(float)) for a in (normals, tangents)), strict=True):
+        t = unit(tangent - normal * (normal @ tangent))
+        frames.append(any_frame(normal) if lobes.isotropic else np.stack([t, np.cross(normal, t), normal], axis=-1))
+    local = np.einsum("pij,pi->pj", frames, unit(views[:100].astype(float))).astype(dtype)
+    weights = np.asarray(jax.jit(jax.vmap(lobes.slice_weights))(local), float)
+    expected = np.array([equation_22(lobes, w, light.astype(float), r) for w, r in zip(weights, frames, strict=True)])
+    bound = 1e-5 if dtype == np.float32 else 1e-12
+    assert np.max(np.abs(got[:100] - expected)) <= bound * np.max(np.abs(expected))
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_radiance_is_the_rotated_product(material, dtype, rng):
+    lobes = lobes_of(material, dtype)
+    light, normals, views, tangents = scene(rng, COUNT, dtype)
+    got = shading.shade_environment(lobes, light, normals, views, tangents)
+
+    def product(normal, view, tangent):
+        t = tangent - normal * jnp.dot(normal, tangent)
+        t = t / jnp.linalg.norm(t)
+        frame = jnp.stack([t, jnp.cross(normal, t), normal], axis=-1)
+        lobe = harmonics.rotate(lobes.slice_coefficients(frame.T @ view), frame)
+        return jnp.einsum("...n,...n->...", lobe, light) if lobes.colour else jnp.einsum("n,cn->c", lobe, light)
+
+    expected = jax.jit(jax.vmap(product))(*(jnp.asarray(a) for a in (normals, views, tangents)))
+    bound = 1e-5 if dtype == np.float32 else 1e-12
+    assert np.max(np.abs(got - expected)) <= bound * np.max(np.abs(expected))
+
+
+def test_diffuse_surface_in_constant_light(dtype):
+    light = jnp.zeros(49, dtype).at[0].set(np.sqrt(4 * np.pi))  # radiance 1 from everywhere
+    normals = jnp.asarray(np.concatenate([np.eye(3), -np.eye(3)]), dtype)
+    got = shading.shade_environment(tabulate(models.Lambertian(0.7)), light, normals, normals)
+    np.testing.assert_allclose(got, 0.7, rtol=3e-6)
+
+
+def test_band_limited_light_against_quadrature(x64, rng):
+    """The slice integrated directly against the light, at a tabulated view: no spline, no lobes, no frame of ours."""
+    brdf = models.Ggx(0.4, [0.3, 0.5, 0.9])
+    lobes = tabulate(brdf)
+    light, normals, _, _ = scene(rng, 5, np.float64)
+    theta, nodes, weights = (3 + 0.5) * np.pi / 32, *np.polynomial.legendre.leggauss(400)
+    z, phi = (nodes + 1) / 2, (np.arange(800) + 0.5) * 2 * np.pi / 800
+    sine = np.sqrt(1 - z**2)[:, None]
+    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.broadcast_to(z[:, None], (400, 800))], axis=-1).reshape(-1, 3)
+    area = np.repeat(weights / 2 * 2 * np.pi / 800, 800)
+    wo = jnp.asarray([np.sin(theta), 0, np.cos(theta)])
+    kernel = np.asarray(jax.vmap(lambda w: brdf.value_cosine(w, wo))(jnp.asarray(wi)))
+    for normal in normals:
+        frame = any_frame(normal)
+        radiance = real_sh(wi @ frame.T, DEGREE) @ light.T
+        expected = np.sum(kernel * radiance * area[:, None], axis=0)
+        got = shading.shade_environment(lobes, light, normal, frame @ np.asarray(wo))
+        np.testing.assert_allclose(got, expected, atol=2e-6 * np.max(np.abs(expected)))
+
+
+def test_views_between_the_nodes_are_interpolated_well(x64):
+    """Slices at other elevations than the tabulated ones, against a finer table that has them as nodes."""
+    brdf = models.Ggx(0.3, 0.04)
+    basis = decomposition.RotatedZonalBasis(decomposition.fibonacci_directions(13), DEGREE)
+    default = shading.tabulate_brdf(brdf, basis)
+    finer = shading.tabulate_brdf(brdf, basis, views=192)  # every third node is one of the 64
+    c = np.asarray(finer.coefficients())
+    theta = (np.arange(192) + 0.5) * np.pi / 384
+    views = jnp.stack([jnp.sin(theta), 0 * theta, jnp.cos(theta)], axis=-1)
+    got = jax.vmap(default.slice_coefficients)(views)
+    error = np.max(np.abs(got - c), axis=1) / np.max(np.abs(c))
+    assert np.max(error[:-6]) < 1e-5
+    assert np.max(error) < 1e-3  # beyond the last node, half a degree above the horizon
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_derivatives_in_every_argument(material, x64, rng):
+    lobes = lobes_of(material, DOUBLE)
+    light, normals, views, tangents = (jnp.asarray(a) for a in scene(rng, 3, np.float64))
+
+    def radiance(light, normals, views, tangents, axes):
+        moved = eqx.tree_at(lambda x: x.basis.directions, lobes, axes)
+        return shading.shade_environment(moved, light, normals, views, tangents)
+
+    arguments = (light, normals, views, tangents, lobes.basis.directions)
+    check_grads(radiance, arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
+
+
+def test_second_derivatives_in_the_geometry(x64, rng):
+    lobes = lobes_of("glossy", DOUBLE)
+    light, normals, views, _ = (jnp.asarray(a) for a in scene(rng, 2, np.float64))
+    radiance = lambda n, v: jnp.sum(shading.shade_environment(lobes, light, n, v))
+    check_grads(radiance, (normals, views), order=2, modes=["rev"], atol=1e-4, rtol=1e-4, eps=1e-5)
+
+
+@pytest.mark.parametrize("brdf", [models.Ggx, lambda alpha: models.CookTorrance(alpha, 0.3, [0.7, 0.5, 0.2])], ids=["ggx", "occt"])
+def test_derivative_in_the_material(brdf, x64, rng):
+    light, normals, views, _ = (jnp.asarray(a) for a in scene(rng, 3, np.float64))
+    radiance = lambda alpha: shading.shade_environment(tabulate(brdf(alpha), throw=False), light, normals, views)
+    check_grads(radiance, (jnp.asarray(0.45),), order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-5, eps=1e-4)
+
+
+AXES = {"+z": [0.0, 0, 1], "-z": [0.0, 0, -1], "+x": [1.0, 0, 0]}
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("material", ["glossy", "brushed"])
+def test_special_geometry_is_ordinary(axis, material, x64, rng):
+    """A normal along an axis of the world, seen along the normal: value and gradient are the limits from nearby."""
+    lobes = lobes_of(material, DOUBLE)
+    light = jnp.asarray(scene(rng, 1, np.float64)[0])
+    normal, tangent = jnp.asarray(AXES[axis]), jnp.asarray(unit(np.array([0.3, 0.5, 0.4])))
+    radiance = lambda n, v: jnp.sum(shading.shade_environment(lobes, light, n, v, tangent))
+    value_and_gradient = jax.jit(jax.value_and_grad(radiance, (0, 1)))
+    value, gradient = value_and_gradient(normal, normal)
+    for offset in rng.normal(size=(3, 3)):
+        near, near_gradient = value_and_gradient(normal + 1e-6 * offset, normal + 1e-6 * offset[::-1])
+        np.testing.assert_allclose(near, value, atol=1e-4)
+        for a, b in zip(near_gradient, gradient, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-3 * (1 + np.max(np.abs(b))))
+    for i in range(2):  # and they are what finite differences see
+        for step in np.eye(3):
+            move = lambda h, step=step, i=i: radiance(*(normal + (h * step if j == i else 0) for j in range(2)))
+            slope = (move(1e-5) - move(-1e-5)) / 2e-5
+            np.testing.assert_allclose(gradient[i] @ step, slope, atol=1e-5 * (1 + abs(slope)))
+
+
+def test_view_below_the_horizon_is_black(dtype):
+    light = jnp.ones((3, 49), dtype)
+    normal = jnp.asarray([[0, 0, 1.0]], dtype)
+    view = jnp.asarray([[0.3, 0.1, -0.2]], dtype)
+    assert np.array_equal(shading.shade_environment(lobes_of("diffuse", dtype), light, normal, view), np.zeros((1, 3)))
+
+
+def test_shapes_colours_and_lengths(rng):
+    lobes = lobes_of("glossy")
+    light, normals, views, _ = scene(rng, 6, np.float32)
+    flat = shading.shade_environment(lobes, light, normals, views)
+    shaped = shading.shade_environment(lobes, light, 3 * normals.reshape(2, 3, 3), 0.2 * views.reshape(2, 3, 3))
+    np.testing.assert_allclose(shaped.reshape(6, 3), flat, rtol=1e-5, atol=1e-6)
+    assert shading.shade_environment(lobes, light[0], normals[0], views).shape == (6,)
+    assert shading.shade_environment(lobes, light, normals[:0], views[:0]).shape == (0, 3)
+    coloured = shading.shade_environment(lobes_of("diffuse"), light[0], normals, views)
+    broadcast = shading.shade_environment(lobes_of("diffuse"), np.tile(light[:1], (3, 1)), normals, views)
+    np.testing.assert_allclose(coloured, broadcast, rtol=1e-5, atol=1e-6)
+
+
+def test_extra_bands_of_light_or_material_add_nothing(rng):
+    lobes = lobes_of("glossy")
+    light, normals, views, _ = scene(rng, 4, np.float32)
+    low = light[:, :16]
+    padded = np.concatenate([low, np.zeros((3, 33), np.float32)], axis=1)
+    higher = np.concatenate([light, rng.normal(size=(3, 51)).astype(np.float32)], axis=1)
+    shade = lambda e: shading.shade_environment(lobes, e, normals, views)
+    np.testing.assert_allclose(shade(low), shade(padded), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(shade(higher), shade(light), rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_do_not_store_every_pixel(rng):
+    """Reverse mode holds a tile's coefficients, not pixels x coefficients."""
+    lobes = lobes_of("glossy")
+    light, normals, views, _ = scene(rng, 8192, np.float32)
+    loss = lambda n: jnp.sum(shading.shade_environment(lobes, light, n, views) ** 2)
+    memory = jax.jit(jax.grad(loss)).lower(jnp.asarray(normals)).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 8192 * 49 * 3 * 4
+
+
+def test_errors_name_the_argument(as_user, rng):
+    light, normals, views, _ = scene(rng, 2, np.float32)
+    lobes = lobes_of("glossy")
+    with pytest.raises(ValueError, match="`lobes` must come from shading.tabulate_brdf; got Lambertian"):
+        shading.shade_environment(models.Lambertian(0.5), light, normals, views)
+    with pytest.raises(ValueError, match=r"`normals` must have shape \[\.\.\., 3\]; got \[2, 2\]"):
+        shading.shade_environment(lobes, light, normals[:, :2], views)
+    with pytest.raises(ValueError, match="do not broadcast"):
+        shading.shade_environment(lobes, light, normals, np.tile(views, (2, 1))[:3])
+    with pytest.raises(ValueError, match=r"`light_coefficients` must have \(degree \+ 1\)\*\*2"):
+        shading.shade_environment(lobes, light[:, :7], normals, views)
+    with pytest.raises(ValueError, match="`tangents`"):
+        shading.shade_environment(lobes_of("brushed"), light, normals, views)
+    with pytest.raises(ValueError, match="`brdf` must be a models.AbstractBrdf"):
+        shading.tabulate_brdf("gold", lobes.basis)
+    with pytest.raises(ValueError, match="`azimuths` must be even"):
+        shading.tabulate_brdf(models.Lambertian(0.5), lobes.basis, azimuths=7)
+
+
+def test_coarse_quadrature_is_refused():
+    with pytest.raises(Exception, match="quadrature does not resolve this material"):
+        tabulate(models.Ggx(0.05), quadrature=8)
+    assert tabulate(models.Ggx(0.05), quadrature=8, throw=False).quadrature_error > 1e-3

@@ -1,0 +1,181 @@
+"""The reference estimators against closed values, against each other, and their error bars against the truth."""
+
+import ast
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from shisd import models, reference
+
+SUN_ROW, SUN_COLUMN, HEIGHT = 60, 37, 256
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def points(rng, count, dtype="float32"):
+    """Normals and views above their horizon."""
+    normals = unit(rng.normal(size=(count, 3)))
+    views = unit(rng.normal(size=(count, 3)))
+    views *= np.sign(np.sum(normals * views, axis=1, keepdims=True))
+    return normals.astype(dtype), views.astype(dtype)
+
+
+def colour(*values):
+    return np.array(values, "float32")
+
+
+def room(height=32, dtype="float32"):
+    """A coloured sky with three small lamps, one of them across the seam of the map and one at the pole."""
+    rng = np.random.default_rng(7)
+    texels = rng.gamma(0.5, size=(height, 2 * height, 3))
+    texels[10, 20] = texels[3, 0] = texels[3, -1] = texels[0, 5] = (400, 300, 200)
+    return models.Environment(jnp.asarray(texels, dtype))
+
+
+def sigmas(estimate, truth, doubt=0.0):
+    """Signed distance from the truth, itself uncertain by `doubt`, in standard errors; 1e-6 of rounding is free."""
+    error = np.asarray(estimate.value - truth)
+    return error / np.sqrt(np.asarray(estimate.standard_error) ** 2 + doubt**2 + (1e-6 * np.max(np.abs(truth))) ** 2)
+
+
+BRDFS = {
+    "lambertian": lambda: models.Lambertian(colour(0.8, 0.5, 0.2)),
+    "phong": lambda: models.Phong(specular=0.7, exponent=40.0, diffuse=0.1),
+    "ggx": lambda: models.Ggx(0.25),
+    "narrow": lambda: models.Ggx(0.1, f0=colour(1.0, 0.8, 0.3)),
+    "plastic": lambda: models.CookTorrance(roughness=0.4, metallic=0.0, albedo=colour(0.7, 0.1, 0.1)),
+}
+
+
+def test_white_furnace_gives_albedo_times_radiance(dtype, rng):
+    normals, views = points(rng, 50, dtype)
+    albedo, radiance = np.array([0.8, 0.5, 0.2], dtype), 2.5
+    brdf = models.Lambertian(albedo)
+    environment = models.Environment(jnp.full((16, 32), radiance, dtype))
+    estimate = reference.shade_environment(brdf, environment, normals, views, key=jax.random.key(1), samples=1024)
+    truth = np.broadcast_to(albedo * radiance, (50, 3))
+    assert estimate.value.shape == estimate.standard_error.shape == (50, 3)
+    assert estimate.value.dtype == dtype
+    assert np.max(np.abs(sigmas(estimate, truth))) < 5
+    assert np.max(estimate.standard_error / truth) < 0.01
+    exact = reference.shade_environment_quadrature(brdf, environment, normals[:5], views[:5], supersampling=16)
+    assert exact.dtype == dtype
+    np.testing.assert_allclose(exact, truth[:5], rtol=1e-3)  # the middle rule meets the kink at the horizon
+
+
+@pytest.mark.parametrize("name", BRDFS)
+def test_the_two_estimators_agree(name, rng):
+    normals, views = points(rng, 48)
+    brdf, environment = BRDFS[name](), room()
+    estimate = reference.shade_environment(brdf, environment, normals, views, key=jax.random.key(2), samples=4096)
+    truth = reference.shade_environment_quadrature(brdf, environment, normals, views, supersampling=12)
+    coarse = reference.shade_environment_quadrature(brdf, environment, normals, views, supersampling=6)
+    doubt = np.abs(truth - coarse)
+    assert np.sqrt(np.mean(doubt**2)) < 2e-3 * np.sqrt(np.mean(truth**2))
+    z = sigmas(estimate, truth, doubt)
+    assert np.max(np.abs(z)) < 5
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.3  # the error bars mean what they say
+
+
+def test_a_lobe_under_a_small_sun_by_hand():
+    """One bright texel of radiance L: the result is L f cos(theta) times the texel's solid angle (its tent in bilinear
+    interpolation has the same volume), up to the lobe's curvature over one texel, about 1e-3 here."""
+    radiance, exponent = 1e4, 20.0
+    texels = np.zeros((HEIGHT, 2 * HEIGHT), np.float32)
+    texels[SUN_ROW, SUN_COLUMN] = radiance
+    theta = math.pi * (SUN_ROW + 0.5) / HEIGHT
+    phi = math.pi * (SUN_COLUMN + 0.5) / HEIGHT
+    sun = np.array([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
+    solid_angle = math.pi / HEIGHT * (math.cos(math.pi * SUN_ROW / HEIGHT) - math.cos(math.pi * (SUN_ROW + 1) / HEIGHT))
+
+    normal = unit(np.array([0.3, 0.2, 0.9]))
+    view = unit(np.array([-0.5, 0.1, 0.8]))
+    mirrored = 2 * np.dot(normal, view) * normal - view
+    lobe = (exponent + 2) / (2 * math.pi) * np.dot(mirrored, sun) ** exponent
+    by_hand = radiance * solid_angle * lobe * np.dot(normal, sun)
+
+    brdf, environment = models.Phong(specular=1.0, exponent=exponent), models.Environment(jnp.asarray(texels))
+    where = normal[None].astype("f4"), view[None].astype("f4")
+    estimate = reference.shade_environment(brdf, environment, *where, key=jax.random.key(3), samples=8192)
+    quadrature = reference.shade_environment_quadrature(brdf, environment, *where, supersampling=3)
+    assert abs(float(quadrature[0]) - by_hand) < 2e-3 * by_hand
+    assert abs(float(estimate.value[0]) - by_hand) < 5 * float(estimate.standard_error[0]) + 2e-3 * by_hand
+    assert float(estimate.standard_error[0]) < 0.02 * by_hand
+
+
+def test_error_bars_shrink_with_samples_and_points_are_independent(rng):
+    normals, views = points(rng, 1)
+    normals, views = np.repeat(normals, 400, axis=0), np.repeat(views, 400, axis=0)
+    bars = []
+    for samples in (128, 2048):
+        estimate = reference.shade_environment(
+            models.Ggx(0.3), room(), normals, views, key=jax.random.key(4), samples=samples
+        )
+        spread = np.std(estimate.value, axis=0)
+        bars.append(np.sqrt(np.mean(estimate.standard_error**2, axis=0)))
+        np.testing.assert_allclose(bars[-1], spread, rtol=0.15)  # the bar is the spread of independent estimates
+    assert np.all(bars[1] < bars[0] / 4)  # at least as fast as plain Monte Carlo
+
+
+def test_dark_cases_are_zero(rng):
+    normals, views = points(rng, 8)
+    brdf = models.Ggx(0.3)
+    black = models.Environment(jnp.zeros((8, 16, 3)))
+    for environment, view in ((black, views), (room(), -views)):
+        estimate = reference.shade_environment(brdf, environment, normals, view, key=jax.random.key(5), samples=64)
+        quadrature = reference.shade_environment_quadrature(brdf, environment, normals, view, supersampling=1)
+        for value in (estimate.value, estimate.standard_error, quadrature):
+            np.testing.assert_array_equal(value, np.zeros((8, 3)))
+
+
+def test_tangents_turn_an_anisotropic_lobe(rng):
+    brdf, environment = models.Ggx(np.float32([0.1, 0.5])), room()
+    normals, views = points(rng, 6)
+    along = np.asarray(jax.random.normal(jax.random.key(0), (6, 3)))
+    across = np.cross(normals, along)
+    results = []
+    for tangents in (along, across):
+        estimate = reference.shade_environment(
+            brdf, environment, normals, views, key=jax.random.key(6), samples=4096, tangents=tangents
+        )
+        truth = reference.shade_environment_quadrature(
+            brdf, environment, normals, views, supersampling=8, tangents=tangents
+        )
+        assert np.max(np.abs(sigmas(estimate, truth))) < 5
+        results.append(truth)
+    assert np.max(np.abs(results[0] - results[1])) > 0.1 * np.max(results[0])
+    turned = reference.shade_environment_quadrature(
+        models.Ggx(np.float32([0.5, 0.1])), environment, normals, views, supersampling=8, tangents=along
+    )
+    np.testing.assert_allclose(turned, results[1], rtol=2e-4, atol=1e-4)
+
+
+def test_what_cannot_be_shaded_is_refused(as_user):
+    brdf, environment = models.Lambertian(0.5), room()
+    normals = np.ones((4, 3), np.float32)
+    for shade, options in (
+        (reference.shade_environment, {"key": jax.random.key(0)}),
+        (reference.shade_environment_quadrature, {}),
+    ):
+        with pytest.raises(ValueError, match=r"`normals` and `views` must both have shape \[N, 3\]"):
+            shade(brdf, environment, normals, normals[0], **options)
+        with pytest.raises(ValueError, match="`tangents` must have the shape of `normals`"):
+            shade(brdf, environment, normals, normals, tangents=normals[:2], **options)
+        with pytest.raises(ValueError, match="this BRDF is anisotropic"):
+            shade(models.Ggx(np.float32([0.1, 0.2])), environment, normals, normals, **options)
+    with pytest.raises(ValueError, match="`samples`"):
+        reference.shade_environment(brdf, environment, normals, normals, key=jax.random.key(0), samples=0)
+    with pytest.raises(ValueError, match="`supersampling`"):
+        reference.shade_environment_quadrature(brdf, environment, normals, normals, supersampling=0)
+
+
+def test_the_reference_shares_nothing_with_the_fast_path():
+    tree = ast.parse(Path(reference.__file__).read_text())
+    own = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and "shisd" in node.module}
+    assert own <= {"shisd", "shisd._numerics", "shisd._typing", "shisd.models"}, own
