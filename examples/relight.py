@@ -27,7 +27,7 @@ from shisd import decomposition, io, models, plotting, reference, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 DEGREES = (4, 8, 16, 30)
-MAPS = {"interior": ("interior.hdr", 0.55, -0.363), "studio": ("studio.exr", 1.0, -0.451)}  # file, exposure, turn (1 = whole)
+MAPS = {"interior": ("interior.hdr", 0.55, -0.363), "studio": ("studio.exr", 1.0, -0.451)}  # file, exposure, turns
 AZIMUTH = 5.0  # of the camera, in radians
 WORST, BEST = 1.0, 1e-3  # relative errors at the ends of the false-colour scale
 
@@ -185,7 +185,8 @@ def contact_sheet(path: Path, title: str, panels: dict, degrees: tuple[int, ...]
             for k, (image, error) in enumerate(images):
                 grid[2 * i, k].imshow(image, interpolation="nearest")
                 grid[2 * i + 1, k].imshow(error, interpolation="nearest")
-                write(grid[2 * i + 1, k], 0.97, 0.04, ("noise " if k == 0 else "") + f"{100 * errors[material][k]:.2g} %")
+                text = f"{100 * errors[material][k]:.2g} %"
+                write(grid[2 * i + 1, k], 0.97, 0.04, text if k else f"noise {text}")
         for k, name in enumerate(["Monte Carlo", *(f"degree {d}" for d in degrees)]):
             grid[0, k].set_title(name, color=ink, fontsize=10)
         figure.suptitle(title, x=0.06, ha="left", y=1 - 0.18 / height, fontsize=13)

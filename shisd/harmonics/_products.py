@@ -72,7 +72,7 @@ def product_matrix(coefficients: ArrayLike, degree: int) -> Float[Array, "n n"]:
 
 @functools.partial(jax.jit, static_argnums=4)
 def _product_matrix(g: Array, azimuth: Array, polar: Array, padded: Array, degree: int) -> Float[Array, "n n"]:
-    band, order = _tables.bands(degree), _tables.orders(degree) + degree
+    band, order = _index(_tables.bands(degree)), _index(_tables.orders(degree) + degree)
     pairs = jnp.einsum("jc,cm,cn->jmn", g, azimuth, azimuth)  # integral of T_m g T_m' along row j
     columns = pairs[:, :, order] * polar.T[:, None, :]  # [row, m, column of the matrix]
     matrix = jnp.einsum("mlj,jmn->mln", padded, columns)[order, band]
@@ -89,6 +89,10 @@ def _matrix_tables(degree: int, rows: int, columns: int) -> tuple[np.ndarray, np
     p = _tables.associated_legendre(theta, degree)
     padded = p[:, np.abs(m)].transpose(1, 0, 2) * weights * (2 * np.pi / columns)
     return azimuth, p[_tables.bands(degree), np.abs(_tables.orders(degree))], padded
+
+
+def _index(table: np.ndarray) -> np.ndarray:
+    return table.astype(np.int32)  # an int64 table that was traced without x64 fails in a trace with it
 
 
 def _grid(degree: int) -> tuple[int, int]:
@@ -118,5 +122,5 @@ def convolve(coefficients: ArrayLike, zonal: ArrayLike) -> Float[Array, "*batch 
             f"batch axes of `coefficients` {list(c.shape)} and `zonal` {list(k.shape)} do not broadcast."
         ) from error
     factors = k.astype(dtype) / jnp.broadcast_to(jnp.asarray(_tables.zonal_norms(degree), dtype), k.shape)
-    factors = jnp.broadcast_to(factors[..., _tables.bands(degree)], (*shape, c.shape[-1]))
+    factors = jnp.broadcast_to(factors[..., _index(_tables.bands(degree))], (*shape, c.shape[-1]))
     return jnp.broadcast_to(c.astype(dtype), factors.shape) * factors

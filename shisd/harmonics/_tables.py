@@ -147,7 +147,7 @@ def generator_gather(degree: int) -> tuple[Gather, ...]:
 
     for l in range(1, degree + 1):
         for m in range(-l, l + 1):
-            add(2, l, m, -m, -m)
+            add(2, l, m, -m, -float(m))
         a = np.sqrt(l * (l + 1) / 2)
         add(0, l, -1, 0, a)
         add(1, l, 1, 0, -a)

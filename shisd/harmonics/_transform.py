@@ -201,7 +201,7 @@ def _block_index(degree: int) -> np.ndarray:
     n = degree // 2 + 1
     l, m = _tables.bands(degree), _tables.orders(degree)
     place = (l % 2, np.abs(m) % 2, np.abs(m) // 2, l // 2, (m < 0).astype(int))
-    return np.ravel_multi_index(place, (2, 2, n, n, 2)).astype(np.int32)  # not int64: the same in both precisions
+    return np.ravel_multi_index(place, (2, 2, n, n, 2)).astype(np.int32)  # int64 fails once traced in both precisions
 
 
 def _round(table: np.ndarray, dtype: DTypeLike) -> np.ndarray:

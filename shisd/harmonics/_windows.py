@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize
-from shisd._typing import Array, Float, Scalar, Vector
+from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import _quadrature, _sh, _tables, _transform
 
 _CANDIDATES, _STEPS = 8, 6  # local minima of the grid that are refined, and Newton steps from each
@@ -77,7 +77,7 @@ def apply_window(coefficients: ArrayLike, window: ArrayLike) -> Float[Array, "*b
             f"{list(window.shape)}."
         )
     dtype = jnp.promote_types(c.dtype, window.dtype)
-    return c.astype(dtype) * jnp.broadcast_to(window.astype(dtype)[_tables.bands(degree)], c.shape)
+    return c.astype(dtype) * jnp.broadcast_to(window.astype(dtype)[_tables.bands(degree).astype(np.int32)], c.shape)
 
 
 class WindowStatus(eqx.Enumeration):
@@ -125,7 +125,7 @@ def _dering_each(c: Float[Array, "f n"], floor: Scalar, degree: int) -> tuple[Ar
     return jax.vmap(lambda c: _dering(c, floor, degree))(c)
 
 
-def _dering(c: Vector, floor: Scalar, degree: int) -> tuple[Array, Array, Array]:
+def _dering(c: Float[Array, " n"], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:
     curvature = jnp.asarray(_curvature(degree)[_tables.bands(degree)], c.dtype)
 
     def windowed(c, log_strength):
@@ -167,7 +167,7 @@ def _dering(c: Vector, floor: Scalar, degree: int) -> tuple[Array, Array, Array]
     return jnp.where(hopeless, mean, c / (1 + strength * curvature)), jnp.where(hopeless, jnp.inf, strength), hopeless
 
 
-def _lowest_direction(c: Vector, degree: int) -> Vector:
+def _lowest_direction(c: Float[Array, " n"], degree: int) -> Float[Array, "3"]:
     """Where the expansion is lowest: the local minima of a grid, refined by Newton steps in the tangent plane."""
     height = 4 * (degree + 1)
     grid = jnp.asarray(_map_directions(height), c.dtype)
@@ -183,41 +183,38 @@ def _lowest_direction(c: Vector, degree: int) -> Vector:
     unit = (1e-4 if c.dtype == np.float64 else 1e-2) / (degree + 1)  # far below the finest wave, far above rounding
 
     def step(u, _):
-        x, y = (v[:, None] for v in _tangents(u))
-        offsets = jnp.asarray(unit * lattice, c.dtype)
-        f = _sh.evaluate(c, u[:, None] + offsets[:, :1] * x + offsets[:, 1:] * y).reshape(-1, 3, 3)
-        slope_x, slope_y = (f[:, 2, 1] - f[:, 0, 1]) / 2, (f[:, 1, 2] - f[:, 1, 0]) / 2
-        xx, yy = f[:, 2, 1] - 2 * f[:, 1, 1] + f[:, 0, 1], f[:, 1, 2] - 2 * f[:, 1, 1] + f[:, 1, 0]
-        xy = (f[:, 2, 2] - f[:, 2, 0] - f[:, 0, 2] + f[:, 0, 0]) / 4
+        frame = _tangents(u)
+        f = _sh.evaluate(c, u[None] + jnp.asarray(unit * lattice, c.dtype) @ frame).reshape(3, 3)
+        slope_x, slope_y = (f[2, 1] - f[0, 1]) / 2, (f[1, 2] - f[1, 0]) / 2
+        xx, yy = f[2, 1] - 2 * f[1, 1] + f[0, 1], f[1, 2] - 2 * f[1, 1] + f[1, 0]
+        xy = (f[2, 2] - f[2, 0] - f[0, 2] + f[0, 0]) / 4
         # Made positive definite: a minimum along a curve has one curvature of zero.
         least = (xx + yy) / 2 - jnp.hypot((xx - yy) / 2, xy)
         lift = jnp.maximum(1e-3 * (jnp.abs(xx) + jnp.abs(yy)) - least, 0)
         xx, yy = xx + lift, yy + lift
         determinant = xx * yy - xy * xy
-        t = jnp.stack([xy * slope_y - yy * slope_x, xy * slope_x - xx * slope_y], axis=-1)
-        t = unit * t / jnp.where(determinant > 0, determinant, 1)[:, None]
-        length = jnp.hypot(t[:, 0], t[:, 1])
-        t = t * (spacing / jnp.maximum(length, spacing))[:, None]
-        return normalize(u + t[:, :1] * x[:, 0] + t[:, 1:] * y[:, 0]), None
+        t = jnp.stack([xy * slope_y - yy * slope_x, xy * slope_x - xx * slope_y])
+        t = unit * t / jnp.where(determinant > 0, determinant, 1)
+        t = t * spacing / jnp.maximum(jnp.hypot(t[0], t[1]), spacing)
+        return normalize(u + t @ frame), None
 
-    refined, _ = jax.lax.scan(step, starts, length=_STEPS)
+    refined = jax.vmap(lambda u: jax.lax.scan(step, u, length=_STEPS)[0])(starts)
     candidates = jnp.concatenate([starts, refined])
     return candidates[jnp.argmin(_sh.evaluate(c, candidates))]
 
 
-def _on_grid(c: Vector, degree: int) -> Float[Array, "h w"]:
+def _on_grid(c: Float[Array, " n"], degree: int) -> Float[Array, "h w"]:
     height = 4 * (degree + 1)
     return _transform.synthesize(c[None], "fejer", height, 2 * height)[..., 0]
 
 
-def _tangents(u: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"]]:
-    """Two unit vectors that complete each `u` to a frame (Duff et al. 2017)."""
-    x, y, z = u[:, 0], u[:, 1], u[:, 2]
+def _tangents(u: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """Two unit vectors that complete `u` to a frame (Duff et al. 2017)."""
+    x, y, z = u
     sign = jnp.where(z < 0, -1, 1).astype(u.dtype)
     a = -1 / (sign + z)
     b = x * y * a
-    first, second = [1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]
-    return jnp.stack(first, axis=-1), jnp.stack(second, axis=-1)
+    return jnp.stack([1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y]).reshape(2, 3)
 
 
 @functools.cache
@@ -232,7 +229,7 @@ def _curvature(degree: int) -> np.ndarray:
     return (l * (l + 1)) ** 2
 
 
-def _mean(c: Vector) -> Scalar:
+def _mean(c: Float[Array, " n"]) -> Scalar:
     return c[0] * float(_tables.zonal_norms(0)[0])
 
 

@@ -25,6 +25,13 @@ def unit(rng, *shape):
     return z / np.linalg.norm(z, axis=-1, keepdims=True)
 
 
+# compiled once per degree, number of axes and dtype: eager tests would spend their time on compiling single operations
+weights_of = eqx.filter_jit(RotatedZonalBasis.weights)
+coefficients_of = eqx.filter_jit(RotatedZonalBasis.coefficients)
+evaluate_of = eqx.filter_jit(RotatedZonalBasis.evaluate)
+conditions_of = eqx.filter_jit(RotatedZonalBasis.condition_numbers)
+
+
 def band(array, l):
     return np.asarray(array, np.float64)[..., l * l : (l + 1) ** 2]
 
@@ -37,7 +44,7 @@ def there_and_back(basis, coefficients):
 
 
 @pytest.mark.parametrize("nested", [False, True], ids=["shared", "nested"])
-@pytest.mark.parametrize("degree", [0, 1, 4, 8, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("degree", [0, 4, 8, pytest.param(20, marks=pytest.mark.slow)])
 def test_round_trips_are_as_exact_as_the_condition_allows(degree, nested, dtype, rng):
     norms = lambda a: np.linalg.norm(np.asarray(a, np.float64), axis=-1)
     eps = np.finfo(dtype).eps
@@ -56,7 +63,7 @@ def test_round_trips_are_as_exact_as_the_condition_allows(degree, nested, dtype,
 def test_any_weights_survive_where_a_band_is_square(nested, x64, rng):
     basis = RotatedZonalBasis(decomposition.optimized_directions(5), 5, nested=nested)
     w = np.where(np.arange(11) <= 2 * np.arange(6)[:, None], rng.standard_normal((6, 11)), 0)
-    again = np.asarray(basis.weights(basis.coefficients(w)))
+    again = np.asarray(weights_of(basis, coefficients_of(basis, w)))
     bands = range(6) if nested else [5]
     for l in bands:
         np.testing.assert_allclose(again[l], w[l], atol=1e-13)
@@ -66,7 +73,7 @@ def test_any_weights_survive_where_a_band_is_square(nested, x64, rng):
 def test_weights_are_those_of_least_norm(name, x64, rng):
     degree = 6
     z, c = SETS[name](degree), rng.standard_normal((4, 49))
-    w = np.asarray(RotatedZonalBasis(z, degree).weights(c))
+    w = np.asarray(weights_of(RotatedZonalBasis(z, degree), c))
     for l, m in enumerate(truth.matrices(z, degree)):
         expected = band(c, l) @ np.linalg.pinv(m).T
         np.testing.assert_allclose(w[:, l], expected, atol=1e-14 * np.linalg.cond(m) ** 2)
@@ -75,7 +82,7 @@ def test_weights_are_those_of_least_norm(name, x64, rng):
 def test_nested_weights_solve_the_prefix(x64, rng):
     degree = 6
     z, c = decomposition.optimized_directions(degree), rng.standard_normal(49)
-    w = np.asarray(RotatedZonalBasis(z, degree, nested=True).weights(c))
+    w = np.asarray(weights_of(RotatedZonalBasis(z, degree, nested=True), c))
     for l, m in enumerate(truth.matrices(z, degree)):
         used = slice(2 * l + 1)
         np.testing.assert_allclose(w[l, used], np.linalg.solve(m[:, used], band(c, l)), rtol=1e-11, atol=1e-12)
@@ -83,14 +90,14 @@ def test_nested_weights_solve_the_prefix(x64, rng):
 
 
 @pytest.mark.parametrize("nested", [False, True], ids=["shared", "nested"])
-@pytest.mark.parametrize("degree", [0, 1, 3, 8, 16])
+@pytest.mark.parametrize("degree", [0, 1, 8, pytest.param(20, marks=pytest.mark.slow)])
 def test_evaluation_equals_the_expansion(degree, nested, dtype, rng):
     basis = RotatedZonalBasis(decomposition.optimized_directions(degree), degree, nested=nested)
     c, w = rng.standard_normal((degree + 1) ** 2).astype(dtype), unit(rng, 3, 7).astype(dtype)
     w[0, 0] = [0, 0, 1]
     w[0, 1] = [0, 0, -1]
-    weights = basis.weights(c)
-    got = basis.evaluate(weights, w)
+    weights = weights_of(basis, c)
+    got = evaluate_of(basis, weights, w)
     assert got.shape == (3, 7) and got.dtype == dtype
     expected = truth.sh(np.reshape(w, (-1, 3)).astype(np.float64), degree) @ c
     scale = np.sqrt((2 * degree + 1) / (4 * np.pi)) * np.abs(np.asarray(weights)).sum()
@@ -100,7 +107,7 @@ def test_evaluation_equals_the_expansion(degree, nested, dtype, rng):
 def test_evaluation_at_degree_32_in_float32(rng):
     basis = RotatedZonalBasis(decomposition.optimized_directions(32), 32)
     weights, w = rng.standard_normal((33, 65)).astype(np.float32), unit(rng, 50).astype(np.float32)
-    got = np.asarray(eqx.filter_jit(basis.evaluate)(weights, w))
+    got = np.asarray(evaluate_of(basis, weights, w))
     x = w.astype(np.float64) @ np.asarray(basis.directions, np.float64).T
     norms = np.sqrt((2 * np.arange(33) + 1) / (4 * np.pi))
     expected = sum(np.polynomial.legendre.legval(x[:, k], norms * weights[:, k]) for k in range(65))
@@ -110,8 +117,8 @@ def test_evaluation_at_degree_32_in_float32(rng):
 def test_nested_basis_ignores_weights_outside_its_prefixes(x64, rng):
     basis = RotatedZonalBasis(decomposition.optimized_directions(3), 3, nested=True)
     w, at = rng.standard_normal((4, 7)), unit(rng, 5)
-    c = basis.coefficients(w)
-    np.testing.assert_allclose(basis.evaluate(w, at), truth.sh(at, 3) @ np.asarray(c), atol=1e-13)
+    c = coefficients_of(basis, w)
+    np.testing.assert_allclose(evaluate_of(basis, w, at), truth.sh(at, 3) @ np.asarray(c), atol=1e-13)
 
 
 def test_rotating_the_axes_rotates_the_function(x64, rng):
@@ -119,16 +126,18 @@ def test_rotating_the_axes_rotates_the_function(x64, rng):
     rotation *= np.linalg.det(rotation)
     z, w, at = decomposition.optimized_directions(5), rng.standard_normal((6, 11)), unit(rng, 9)
     plain, turned = RotatedZonalBasis(z, 5), RotatedZonalBasis(z @ rotation.T, 5)
-    np.testing.assert_allclose(turned.evaluate(w, at), plain.evaluate(w, at @ rotation), atol=1e-13)
-    np.testing.assert_allclose(turned.condition_numbers(), plain.condition_numbers(), rtol=1e-12)
-    np.testing.assert_allclose(truth.sh(at, 5) @ np.asarray(turned.coefficients(w)), turned.evaluate(w, at), atol=1e-13)
+    np.testing.assert_allclose(evaluate_of(turned, w, at), evaluate_of(plain, w, at @ rotation), atol=1e-13)
+    np.testing.assert_allclose(conditions_of(turned), conditions_of(plain), rtol=1e-12)
+    np.testing.assert_allclose(
+        truth.sh(at, 5) @ np.asarray(coefficients_of(turned, w)), evaluate_of(turned, w, at), atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("nested", [False, True], ids=["shared", "nested"])
 def test_condition_numbers_agree_with_numpy(name, nested, x64):
     z = SETS[name](7)
-    got = RotatedZonalBasis(z, 7, nested=nested).condition_numbers()
+    got = conditions_of(RotatedZonalBasis(z, 7, nested=nested))
     np.testing.assert_allclose(got, truth.conditions(z, 7, nested), rtol=1e-9)
 
 
@@ -138,37 +147,37 @@ def test_axes_of_any_length_are_normalised_and_opposite_axes_serve_alike(x64, rn
     scaled = RotatedZonalBasis(z * rng.uniform(1e-3, 1e3, (9, 1)), 4)
     np.testing.assert_allclose(scaled.directions, basis.directions, atol=1e-15)
     flipped = RotatedZonalBasis(z * np.where(np.arange(9) % 2, 1.0, -1.0)[:, None], 4)
-    np.testing.assert_allclose(flipped.condition_numbers(), basis.condition_numbers(), rtol=1e-12)
+    np.testing.assert_allclose(conditions_of(flipped), conditions_of(basis), rtol=1e-12)
     signs = np.where(np.arange(9) % 2, 1.0, -1.0) ** np.arange(5)[:, None]
-    np.testing.assert_allclose(flipped.weights(c), signs * np.asarray(basis.weights(c)), atol=1e-13)
+    np.testing.assert_allclose(weights_of(flipped, c), signs * np.asarray(weights_of(basis, c)), atol=1e-13)
 
 
 # --- batches, jit, precision ------------------------------------------------------------------------------------------
 
 
-def test_batches_equal_loops_and_vmap(dtype, rng):
+def test_batches_equal_loops_and_vmap(x64, rng):
     basis = RotatedZonalBasis(decomposition.optimized_directions(3), 3)
-    c, at = rng.standard_normal((2, 3, 16)).astype(dtype), unit(rng, 2, 3).astype(dtype)
-    eps = 20 * np.finfo(dtype).eps
-    w = basis.weights(c)
+    c, at = jnp.asarray(rng.standard_normal((2, 3, 16))), jnp.asarray(unit(rng, 2, 3))
+    same = lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14)
+    each = lambda method: eqx.filter_jit(eqx.filter_vmap(eqx.filter_vmap(method)))
+    w = weights_of(basis, c)
     assert w.shape == (2, 3, 4, 7)
-    loop = [[basis.weights(c[i, j]) for j in range(3)] for i in range(2)]
-    np.testing.assert_allclose(w, loop, atol=eps)
-    np.testing.assert_allclose(jax.vmap(jax.vmap(basis.weights))(jnp.asarray(c)), w, atol=eps)
-    np.testing.assert_allclose(jax.vmap(jax.vmap(basis.coefficients))(w), basis.coefficients(w), atol=eps)
-    values = basis.evaluate(w, at)
+    same(w, [[weights_of(basis, c[i, j]) for j in range(3)] for i in range(2)])
+    same(each(basis.weights)(c), w)
+    same(each(basis.coefficients)(w), coefficients_of(basis, w))
+    values = evaluate_of(basis, w, at)
     assert values.shape == (2, 3)
-    np.testing.assert_allclose(jax.vmap(jax.vmap(basis.evaluate))(w, jnp.asarray(at)), values, atol=eps)
-    np.testing.assert_allclose(basis.evaluate(w, at[0])[1], basis.evaluate(w[1], at[0]), atol=eps)  # batches broadcast
-    assert basis.weights(c[:0]).shape == (0, 3, 4, 7)
+    same(each(basis.evaluate)(w, at), values)
+    same(evaluate_of(basis, w, at[0])[1], evaluate_of(basis, w[1], at[0]))  # batches broadcast
+    assert weights_of(basis, c[:0]).shape == (0, 3, 4, 7)
 
 
 def test_sets_of_axes_can_be_vmapped(x64, rng):
     sets = jnp.stack([decomposition.fibonacci_directions(7), decomposition.low_discrepancy_directions(7)])
     c = jnp.asarray(rng.standard_normal(16))
-    got = jax.vmap(lambda z: RotatedZonalBasis(z, 3).weights(c))(sets)
+    got = jax.jit(jax.vmap(lambda z: RotatedZonalBasis(z, 3).weights(c)))(sets)
     for z, w in zip(sets, got, strict=True):
-        np.testing.assert_allclose(w, RotatedZonalBasis(z, 3).weights(c), atol=1e-12)
+        np.testing.assert_allclose(w, weights_of(RotatedZonalBasis(z, 3), c), atol=1e-12)
 
 
 def test_jit_equals_eager_and_compiles_once(dtype, rng):
@@ -193,23 +202,37 @@ def test_jit_equals_eager_and_compiles_once(dtype, rng):
 # --- derivatives ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("nested", [False, True], ids=["shared", "nested"])
-@pytest.mark.parametrize("count", [5, 8])
-def test_derivatives_to_second_order(count, nested, x64, rng):
-    z = decomposition.low_discrepancy_directions(count)
+def test_derivatives_of_every_method(x64, rng):
+    z = decomposition.low_discrepancy_directions(6)
     c, at = jnp.asarray(rng.standard_normal(9)), jnp.asarray(unit(rng, 4))
-    fixed = jnp.asarray(rng.standard_normal((3, count)))
+    fixed = jnp.asarray(rng.standard_normal((3, 6)))
 
     @jax.jit
-    def everything(z, c, at):
-        basis = RotatedZonalBasis(z, 2, nested=nested)
-        w = basis.weights(c)
-        return w, basis.coefficients(fixed), basis.evaluate(fixed, at)
+    def everything(z, c, fixed, at):
+        basis = RotatedZonalBasis(z, 2)
+        conditions = basis.condition_numbers()[1:]
+        return basis.weights(c), basis.coefficients(fixed), basis.evaluate(fixed, at), conditions
 
-    check_grads(everything, (z, c, at), order=2, modes=("fwd", "rev"), atol=1e-4, rtol=1e-4)
+    check_grads(everything, (z, c, fixed, at), order=1, modes=("fwd", "rev"), atol=1e-6, rtol=1e-6)
 
 
-@pytest.mark.parametrize("degree", [4, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["weights", "evaluate"])
+def test_second_derivatives(method, x64, rng):
+    z = decomposition.low_discrepancy_directions(6)
+    c, at = jnp.asarray(rng.standard_normal(9)), jnp.asarray(unit(rng, 4))
+    mixed = jnp.asarray(rng.standard_normal((3, 6)))
+
+    def loss(z, c, at):
+        basis = RotatedZonalBasis(z, 2)
+        return jnp.sum(mixed * basis.weights(c)) if method == "weights" else jnp.sum(basis.evaluate(mixed, at) ** 2)
+
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))
+    check_grads(gradient, (z, c, at), order=1, modes=("fwd", "rev"), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [4, 12])
 def test_derivatives_of_weights_and_conditions(degree, x64, rng):
     z, c = decomposition.optimized_directions(degree), jnp.asarray(rng.standard_normal((degree + 1) ** 2))
     weights = jax.jit(lambda z, c: RotatedZonalBasis(z, degree).weights(c))
@@ -224,14 +247,16 @@ def test_a_basis_changed_by_gradient_steps_stays_consistent(x64, rng):
     basis = RotatedZonalBasis(decomposition.optimized_directions(3), 3)
     basis = eqx.tree_at(lambda b: b.directions, basis, 1.3 * basis.directions)  # off the sphere
     c, at = rng.standard_normal(16), unit(rng, 6)
-    value, gradient = eqx.filter_value_and_grad(lambda b: jnp.sum(b.evaluate(b.weights(c), at) ** 2))(basis)
+    loss = lambda b: jnp.sum(b.evaluate(b.weights(c), at) ** 2)
+    value, gradient = eqx.filter_jit(eqx.filter_value_and_grad(loss))(basis)
     np.testing.assert_allclose(value, np.sum((truth.sh(at, 3) @ c) ** 2), rtol=1e-12)
     np.testing.assert_allclose(gradient.directions, np.zeros((7, 3)), atol=1e-12 * value)
 
 
 @pytest.mark.parametrize("nested", [False, True], ids=["shared", "nested"])
 def test_axes_at_the_poles_are_ordinary(nested, x64, rng):
-    z = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0.6, 0, 0.8], [0, 0.6, -0.8]], np.float64)
+    z = np.array(decomposition.low_discrepancy_directions(6))
+    z[0], z[5] = [0, 0, 1], [0, 0, -1]  # one axis, so five remain
     c = jnp.asarray(rng.standard_normal(9))
     weights = jax.jit(lambda z: RotatedZonalBasis(z, 2, nested=nested).weights(c))
     check_grads(weights, (jnp.asarray(z),), order=1, modes=("fwd", "rev"), atol=1e-6, rtol=1e-6)
@@ -261,21 +286,21 @@ SINGULAR = {
 
 
 @pytest.mark.parametrize("name", SINGULAR)
-@pytest.mark.parametrize("degree", [1, 4, 8, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("degree", [1, 4, pytest.param(20, marks=pytest.mark.slow)])
 def test_singular_sets_are_refused_with_the_band(name, degree, dtype, as_user):
     z = SINGULAR[name](degree).astype(dtype)
     basis = RotatedZonalBasis(z, degree)
     worst = degree if "two" in name else 1
     with pytest.raises(RuntimeError, match=rf"do not resolve degree {worst}:[\s\S]*optimized_directions"):
-        jax.block_until_ready(eqx.filter_jit(basis.weights)(jnp.zeros((degree + 1) ** 2, dtype)))
-    assert not np.all(np.asarray(basis.condition_numbers()) < 0.01 / np.finfo(dtype).eps)
+        jax.block_until_ready(weights_of(basis, jnp.zeros((degree + 1) ** 2, dtype)))
+    assert not np.all(np.asarray(conditions_of(basis)) < 0.01 / np.finfo(dtype).eps)
 
 
 def test_axes_on_the_cone_of_a_zero_are_refused(dtype, as_user):
     # the cosine to the cone's axis is 1 / sqrt(3), where P_2 = 0: the row m = 0 of M_2 vanishes
     z = circle(5, 1 / np.sqrt(2)).astype(dtype)
     with pytest.raises(RuntimeError, match=r"do not resolve degree 2: [\s\S]*on a cone"):
-        jax.block_until_ready(RotatedZonalBasis(z, 2).weights(jnp.zeros(9, dtype)))
+        jax.block_until_ready(weights_of(RotatedZonalBasis(z, 2), jnp.zeros(9, dtype)))
 
 
 @pytest.mark.parametrize("transform", ["jit", "grad", "vmap"])
@@ -293,14 +318,14 @@ def test_zero_and_non_finite_axes_are_refused_by_every_method(bad, method, as_us
     z = np.array(decomposition.fibonacci_directions(3))
     z[1] = bad
     basis = RotatedZonalBasis(z, 1)
-    arguments = {
-        "weights": (jnp.ones(4),),
-        "coefficients": (jnp.ones((2, 3)),),
-        "evaluate": (jnp.ones((2, 3)), jnp.ones(3)),
-        "condition_numbers": (),
-    }
+    call = {
+        "weights": lambda: weights_of(basis, jnp.ones(4)),
+        "coefficients": lambda: coefficients_of(basis, jnp.ones((2, 3))),
+        "evaluate": lambda: evaluate_of(basis, jnp.ones((2, 3)), jnp.ones(3)),
+        "condition_numbers": lambda: conditions_of(basis),
+    }[method]
     with pytest.raises(RuntimeError, match="vector that is zero or not finite"):
-        jax.block_until_ready(getattr(basis, method)(*arguments[method]))
+        jax.block_until_ready(call())
 
 
 def test_static_problems_are_value_errors(as_user):
@@ -313,7 +338,7 @@ def test_static_problems_are_value_errors(as_user):
         ((z[0], 0), r"must have shape \[K, 3\]; got \[3\]"),
         ((z[None], 0), r"must have shape \[K, 3\]; got \[1, 9, 3\]"),
         ((z[:, :2], 0), r"must have shape \[\.\.\., 3\]"),
-        ((z + 1j, 0), "must hold real numbers"),
+        ((np.ones((3, 3)) + 1j, 0), "must hold real numbers"),
         (("axes", 0), "must be an array of real numbers"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -333,6 +358,6 @@ def test_barely_resolved_sets_pass_and_say_so_by_their_condition(dtype, rng):
     z = spread(5)
     z[1] = z[0] + 3e-2 * np.array([1, -1, 0])
     basis = RotatedZonalBasis(z.astype(dtype), 2)
-    conditions = np.asarray(basis.condition_numbers())
+    conditions = np.asarray(conditions_of(basis))
     assert 30 < conditions[2] < 3000
-    assert np.all(np.isfinite(np.asarray(basis.weights(rng.standard_normal(9).astype(dtype)))))
+    assert np.all(np.isfinite(np.asarray(weights_of(basis, rng.standard_normal(9).astype(dtype)))))

