@@ -107,7 +107,7 @@ def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]
     pairs = jnp.stack(
         [
             (cos @ even) * azimuth[..., order[0::2]],
-            (sin @ odd) * azimuth[..., np.append(order[1::2], 0)[: even.shape[1]]],
+            (sin @ odd) * azimuth[..., np.append(order[1::2], np.int32(0))[: even.shape[1]]],
         ],
         axis=-1,
     )
@@ -184,7 +184,7 @@ def _expand_by_basis(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree
 
 def _fourier(c: Float[Array, "f n"], degree: int) -> tuple[Array, Array]:
     """Double Fourier coefficients of expansions, for even and for odd orders m: [L+1 over k, f * 2 * orders]."""
-    l = np.arange(degree + 1)
+    l = np.arange(degree + 1, dtype=np.int32)
     m = l[:, None]
     positive = jnp.where((l >= m)[None], c[:, np.where(l >= m, l * l + l + m, 0)], 0)  # [f, m, l]
     negative = jnp.where(((l >= m) & (m > 0))[None], c[:, np.where(l >= m, l * l + l - m, 0)], 0)

@@ -49,14 +49,15 @@ def zonal_norms(degree: int) -> np.ndarray:
 
 @functools.cache
 def bands(degree: int) -> np.ndarray:
-    """The degree l of each coefficient."""
-    return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+    """The degree l of each coefficient. Indices are int32 in either precision, so that no trace depends on the mode."""
+    l = np.arange(degree + 1, dtype=np.int32)
+    return np.repeat(l, 2 * l + 1)
 
 
 @functools.cache
 def orders(degree: int) -> np.ndarray:
     """The order m of each coefficient."""
-    return np.concatenate([np.arange(-l, l + 1) for l in range(degree + 1)])
+    return np.concatenate([np.arange(-l, l + 1, dtype=np.int32) for l in range(degree + 1)])
 
 
 @functools.cache
@@ -176,7 +177,7 @@ def _gather(target: np.ndarray, source: np.ndarray, factor: np.ndarray, size: in
     filled = np.zeros(size, int)
     for t, s, f in zip(target, source, factor, strict=True):
         if filled[t] == len(pairs):
-            pairs.append((np.zeros(size, int), np.zeros(size)))
+            pairs.append((np.zeros(size, np.int32), np.zeros(size)))
         index, weight = pairs[filled[t]]
         index[t], weight[t] = s, f
         filled[t] += 1

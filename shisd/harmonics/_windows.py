@@ -91,7 +91,7 @@ class WindowStatus(eqx.Enumeration):
 
 
 class Deringed(NamedTuple):
-    """The result of `dering`: windowed coefficients [..., (L+1)^2], the strengths [...] and their status [...]."""
+    """The result of `dering`: windowed coefficients [..., (L+1)^2], their strengths [...] and one status for all."""
 
     coefficients: Float[Array, "*batch n"]
     strength: Float[Array, "*batch"]
@@ -103,7 +103,7 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
 
     Arguments: `coefficients` [..., (L+1)^2], each expansion by itself; `floor`, a number. Where the expansion is above
     the floor already, it is returned as it is, with strength 0. Where its mean is not above the floor, no window can
-    help: an error, or with `throw=False` the mean alone, with strength inf and that status.
+    help: an error, or with `throw=False` the mean alone, with strength inf, and the status says so.
     Derivatives: of first order, both modes, by the implicit function theorem at the lowest direction; 0 where the
     strength is 0. Not smooth where the lowest direction changes, nor where the strength becomes positive.
     Accuracy: the minimum over the sphere reaches `floor` to 1e-9 of (mean - floor) in float64, 1e-4 in float32.
@@ -113,11 +113,10 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
     c, degree = _checks.coefficients("coefficients", coefficients)
     floor = _scalar("floor", floor).astype(c.dtype)
     windowed, strength, hopeless = _dering_each(c.reshape(-1, c.shape[-1]), floor, degree)
-    strength, hopeless = strength.reshape(c.shape[:-1]), hopeless.reshape(c.shape[:-1])
-    status = WindowStatus.where(hopeless, WindowStatus.mean_below_floor, WindowStatus.ok)
+    status = WindowStatus.where(jnp.any(hopeless), WindowStatus.mean_below_floor, WindowStatus.ok)
     if throw:
-        windowed, strength = status.error_if((windowed, strength), hopeless)
-    return Deringed(windowed.reshape(c.shape), strength, status)
+        windowed, strength = status.error_if((windowed, strength), jnp.any(hopeless))
+    return Deringed(windowed.reshape(c.shape), strength.reshape(c.shape[:-1]), status)
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -89,7 +89,8 @@ def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) 
         local = jnp.einsum("pij,pi->pj", r, view)
         slices = slice_values(table, local, lobes)
         shape = (*colour, *light.shape[1:])
-        radiance = jnp.sum(jnp.broadcast_to(slices, shape) * light.reshape(*e.shape[:-1], *light.shape[1:]), axis=-2)
+        light = light.reshape(*e.shape[:-1], *light.shape[1:])
+        radiance = jnp.sum(jnp.broadcast_to(slices, shape) * jnp.broadcast_to(light, shape), axis=-2)
         return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(radiance, -1, 0))
 
     if count == 0:

@@ -239,7 +239,7 @@ def test_derivatives_of_weights_and_conditions(degree, x64, rng):
     check_grads(weights, (z, c), order=1, modes=("fwd", "rev"), atol=1e-5, rtol=1e-5)
     start = decomposition.fibonacci_directions(2 * degree + 1)
     conditions = jax.jit(lambda z: jnp.log(RotatedZonalBasis(z, degree).condition_numbers()[1:]))
-    check_grads(conditions, (start,), order=1, modes=("fwd", "rev"), atol=1e-4, rtol=1e-4)
+    check_grads(conditions, (start,), order=1, modes=("fwd", "rev"), atol=1e-3, rtol=1e-3)
 
 
 def test_a_basis_changed_by_gradient_steps_stays_consistent(x64, rng):

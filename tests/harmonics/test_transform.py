@@ -37,7 +37,7 @@ def test_synthesis_is_the_expansion_at_the_texel_centres(dtype, rng, height, wid
 
 @pytest.mark.parametrize(("height", "width", "degree"), SIZES)
 def test_projection_of_a_band_limited_map_is_exact(dtype, rng, height, width, degree):
-    band = min(height, width) - degree - 1
+    band = min(height - 1, width - degree - 1)
     c = rng.normal(size=((band + 1) ** 2, 3))
     texels = basis(*texel_centres(height, width), band) @ c
     got = harmonics.project_map(jnp.asarray(texels, dtype), degree)
@@ -59,7 +59,7 @@ def test_colour_axes_lead_the_coefficients_and_end_the_map(dtype, rng, colour):
 def test_map_projection_agrees_with_ducc(x64, rng):
     ducc0 = pytest.importorskip("ducc0")
     height, width, degree = 96, 200, 40
-    texels = rng.normal(size=(height, width))
+    texels = np.asarray(harmonics.synthesize_map(jnp.asarray(rng.normal(size=90**2)), height, width))
     alm = ducc0.sht.experimental.analysis_2d(
         map=texels[None], spin=0, lmax=degree, mmax=degree, geometry="F1", phi0=np.pi / width
     )[0]
@@ -70,9 +70,9 @@ def test_map_projection_agrees_with_ducc(x64, rng):
         l = np.arange(m, degree + 1)
         a = alm[start : start + l.size]
         start += l.size
-        np.testing.assert_allclose(got[l * l + l + m], a.real * (np.sqrt(2) if m else 1), atol=1e-13 * scale)
+        np.testing.assert_allclose(got[l * l + l + m], a.real * (np.sqrt(2) if m else 1), rtol=0, atol=1e-13 * scale)
         if m:
-            np.testing.assert_allclose(got[l * l + l - m], -a.imag * np.sqrt(2), atol=1e-13 * scale)
+            np.testing.assert_allclose(got[l * l + l - m], -a.imag * np.sqrt(2), rtol=0, atol=1e-13 * scale)
 
 
 @pytest.mark.slow
@@ -196,4 +196,4 @@ def test_errors_name_the_argument(as_user):
     with pytest.raises(ValueError, match="`function`"):
         harmonics.project(lambda w: w[:3, 0], 4)
     with pytest.raises(ValueError, match=r"function\(directions\)"):
-        harmonics.project(lambda w: 1j * w[:, 0], 4)
+        harmonics.project(lambda w: w[:, 0].astype(np.complex64), 4)
