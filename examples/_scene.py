@@ -62,7 +62,7 @@ def mesh(path: Path, size: int, azimuth: float) -> View:
     shape.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     shape.apply_translation(-shape.bounds.mean(axis=0))
     eye = 4.4 * np.array([np.cos(azimuth), np.sin(azimuth), 0.25])
-    rays = camera_rays(size, eye, np.zeros(3), np.radians(27))
+    rays = camera_rays(size, eye, np.zeros(3), np.radians(29))
     flat = rays.reshape(-1, 3)
     points, ray, face = shape.ray.intersects_location(np.broadcast_to(eye, flat.shape), flat, multiple_hits=False)
     order = np.argsort(ray)

@@ -13,8 +13,8 @@ def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
 
 def angle_multiples(
     cos: Float[Array, "*batch"], sin: Float[Array, "*batch"], count: int
-) -> tuple[Float[Array, "*batch {count}"], Float[Array, "*batch {count}"]]:
-    """cos(k a) and sin(k a) for k = 0 ... count-1 on a new last axis, from cos(a) and sin(a).
+) -> tuple[Float[Array, "{count} *batch"], Float[Array, "{count} *batch"]]:
+    """cos(k a) and sin(k a) for k = 0 ... count-1 on a new first axis, from cos(a) and sin(a).
 
     Powers of a unit complex number as products of two short tables, a few of them at once: k = giant * i + baby. Every
     power is at most 2 log2(count) products away from the first, so the rounding grows with k, not with k^2.
@@ -23,11 +23,10 @@ def angle_multiples(
     giant = -(-count // baby)
     c, s = _chain(cos, sin, baby + 1)
     big_c, big_s = _chain(c[baby], s[baby], giant)
-    c, s = (jnp.stack(p[:baby], axis=-1)[..., None, :] for p in (c, s))
-    big_c, big_s = (jnp.stack(p, axis=-1)[..., :, None] for p in (big_c, big_s))
-    shape = (*cos.shape, giant * baby)
-    real, imag = big_c * c - big_s * s, big_s * c + big_c * s
-    return real.reshape(shape)[..., :count], imag.reshape(shape)[..., :count]
+    c, s = (jnp.stack(p[:baby])[None] for p in (c, s))
+    big_c, big_s = (jnp.stack(p)[:, None] for p in (big_c, big_s))
+    shape = (giant * baby, *cos.shape)
+    return (big_c * c - big_s * s).reshape(shape)[:count], (big_s * c + big_c * s).reshape(shape)[:count]
 
 
 def _chain(cos: Array, sin: Array, count: int) -> tuple[list[Array], list[Array]]:

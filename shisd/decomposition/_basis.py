@@ -61,7 +61,8 @@ class RotatedZonalBasis(eqx.Module):
 
         Arguments: `coefficients` [..., (L+1)^2]. Returns [..., L+1, K], zeros where a nested band has no axis.
         Accuracy: `weights(coefficients(w))` returns w, if it is of least norm, within 10 eps times the condition number
-        of its band; coefficients come back within 10 eps sqrt(K) times the norm of a band's weights.
+        of its band for K up to 61 (measured 7), and 11 for K = 95 in float32, where sums over K are what rounds.
+        Coefficients come back within 10 eps sqrt(K) times the norm of a band's weights.
         Cost: L+1 QR decompositions of K x (2L+1); batches of coefficients share them.
         """
         c, given = _checks.coefficients("coefficients", coefficients)

@@ -90,7 +90,7 @@ def _rotate_many_away_from_pole(c: Float[Array, "f n"], r: Float[Array, "p 3 3"]
 
 def _turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
     """Cosines and sines [L+1, p] of the multiples of the three angles of each rotation."""
-    return [[p.T for p in angle_multiples(cos, sin, degree + 1)] for cos, sin in _angles(r)]
+    return [list(angle_multiples(cos, sin, degree + 1)) for cos, sin in _angles(r)]
 
 
 def _finish(x: Float[Array, "f n p"], a: list[Array], b: list[Array], degree: int) -> Float[Array, "f n p"]:

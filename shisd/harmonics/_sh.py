@@ -85,33 +85,27 @@ def _evaluate(c: Float[Array, "*c n"], directions: Float[Array, "*d 3"], degree:
     return values.transpose(pairs).reshape(np.broadcast_shapes(c.shape[:-1], u.shape[:-1]))
 
 
-def _azimuth(u: Float[Array, "*batch 3"]) -> tuple[Array, Array, Array]:
-    """rho, cos(phi), sin(phi); phi = 0 at the poles, where every y_l^m with m != 0 vanishes."""
-    rho = jnp.sqrt(u[..., 0] * u[..., 0] + u[..., 1] * u[..., 1])
+def _waves(u: Float[Array, "points 3"], degree: int) -> tuple[Array, Array, Array, Array]:
+    """cos(k theta), sin(k theta), cos(m phi), sin(m phi), each [L+1, points]: points are the vector lanes.
+
+    phi = 0 at the poles, where every y_l^m with m != 0 vanishes.
+    """
+    x, y, z = u.T
+    rho = jnp.sqrt(x * x + y * y)
     safe = jnp.where(rho > 0, rho, 1)
-    return rho, jnp.where(rho > 0, u[..., 0] / safe, 1), u[..., 1] / safe
+    polar = angle_multiples(z, rho, degree + 1)
+    return *polar, *angle_multiples(jnp.where(rho > 0, x / safe, 1), y / safe, degree + 1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]:
     """The basis at unit vectors; off the sphere (in derivatives) the solid harmonics r^l y_l^m."""
-    size = (degree + 1) ** 2
-    rho, cos_phi, sin_phi = _azimuth(u)
-    cos, sin = angle_multiples(u[..., 2], rho, degree + 1)
-    cos_m, sin_m = angle_multiples(cos_phi, sin_phi, degree + 1)
-    even, odd, factors = (jnp.asarray(table, u.dtype) for table in _basis_tables(degree))
+    series, factors = (jnp.asarray(table, u.dtype) for table in _basis_tables(degree))
+    cos, sin, cos_m, sin_m = _waves(u.reshape(-1, 3), degree)
+    polar = jnp.concatenate([cos, sin]).T @ series
     # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
-    azimuth = jnp.concatenate([cos_m, sin_m], axis=-1) @ factors
-    order = _tables.orders(degree) + degree
-    # Index l*(l+1)+m has the parity of m, so cosine and sine series alternate along the last axis.
-    pairs = jnp.stack(
-        [
-            (cos @ even) * azimuth[..., order[0::2]],
-            (sin @ odd) * azimuth[..., np.append(order[1::2], np.int32(0))[: even.shape[1]]],
-        ],
-        axis=-1,
-    )
-    return pairs.reshape(*u.shape[:-1], -1)[..., :size]
+    azimuth = jnp.concatenate([cos_m, sin_m]).T @ factors
+    return (polar * azimuth[:, _tables.orders(degree) + degree]).reshape(*u.shape[:-1], -1)
 
 
 @_basis.defjvp
@@ -126,16 +120,15 @@ def _basis_jvp(degree, primals, tangents):
 
 
 @functools.cache
-def _basis_tables(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Polar series of the even and of the odd orders [L+1, ceil(n/2)], and the map from cos, sin(m phi) to the orders."""
-    series, m = _tables.polar_series(degree), _tables.orders(degree)
-    table = series[np.abs(m), :, _tables.bands(degree)].T * np.where(m == 0, 1, np.sqrt(2))
-    even, odd = table[:, 0::2], table[:, 1::2]
-    odd = np.pad(odd, ((0, 0), (0, even.shape[1] - odd.shape[1])))
+def _basis_tables(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Polar series of every coefficient over cos, then sin(k theta); and the map from cos, then sin(m phi) to the orders."""
+    m = _tables.orders(degree)
+    table = _tables.polar_series(degree)[np.abs(m), :, _tables.bands(degree)].T * np.where(m == 0, 1, np.sqrt(2))
+    series = np.concatenate([np.where(m % 2 == 0, table, 0), np.where(m % 2 == 1, table, 0)])
     factors = np.zeros((2 * (degree + 1), 2 * degree + 1))
     m = np.arange(-degree, degree + 1)
     factors[np.where(m >= 0, m, degree + 1 - m), m + degree] = 1
-    return even, odd, factors
+    return series, factors
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
@@ -143,17 +136,23 @@ def _expand(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) ->
     """Every expansion at every unit vector, as a double Fourier series."""
     even, odd = _fourier(c, degree)
 
-    def at(u: Float[Array, "3"]) -> Float[Array, " f"]:
-        rho, cos_phi, sin_phi = _azimuth(u)
-        cos, sin = angle_multiples(u[2], rho, degree + 1)
-        cos_m, sin_m = angle_multiples(cos_phi, sin_phi, degree + 1)
-        e, o = (cos @ even).reshape(c.shape[0], 2, -1), (sin @ odd).reshape(c.shape[0], 2, -1)
-        trig = jnp.stack([cos_m, sin_m])[None]
-        return jnp.sum(e * trig[..., 0::2], axis=(1, 2)) + jnp.sum(o * trig[..., 1::2], axis=(1, 2))
+    def at(u: Float[Array, "points 3"]) -> Float[Array, "f points"]:
+        cos, sin, cos_m, sin_m = _waves(u, degree)
+        e, o = (w.reshape(c.shape[0], 2, -1, u.shape[0]) for w in (even @ cos, odd @ sin))
+        waves = jnp.stack([cos_m, sin_m])[None]
+        return jnp.sum(e * waves[:, :, 0::2], axis=(1, 2)) + jnp.sum(o * waves[:, :, 1::2], axis=(1, 2))
 
-    if u.shape[0] <= _POINTS_AT_ONCE:
-        return jax.vmap(at, out_axes=1)(u)
-    return jax.lax.map(at, u, batch_size=_POINTS_AT_ONCE).T
+    return _in_tiles(at, u, _POINTS_AT_ONCE)
+
+
+def _in_tiles(function, u: Float[Array, "points 3"], size: int) -> Float[Array, "f points"]:
+    """`function` of all points, at most `size` at a time."""
+    if u.shape[0] <= size:
+        return function(u)
+    whole = u.shape[0] // size
+    tiles = jax.lax.map(function, u[: whole * size].reshape(whole, size, 3))
+    tiles = jnp.moveaxis(tiles, 0, 1).reshape(tiles.shape[1], -1)
+    return jnp.concatenate([tiles, function(u[whole * size :])], axis=1) if u.shape[0] % size else tiles
 
 
 def _expand_jvp(degree, primals, tangents):
@@ -177,13 +176,11 @@ _expand.defjvp(_expand_jvp, symbolic_zeros=True)
 
 def _expand_by_basis(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) -> Float[Array, "f points"]:
     """The same values as products with the basis, which is made again in the backward pass rather than stored."""
-    if u.shape[0] <= _POINTS_AT_ONCE:
-        return c @ _basis(u, degree).T
-    return jax.lax.map(jax.checkpoint(lambda u: c @ _basis(u, degree)), u, batch_size=_POINTS_AT_ONCE // 8).T
+    return _in_tiles(jax.checkpoint(lambda u: c @ _basis(u, degree).T), u, _POINTS_AT_ONCE // 8)
 
 
 def _fourier(c: Float[Array, "f n"], degree: int) -> tuple[Array, Array]:
-    """Double Fourier coefficients of expansions, for even and for odd orders m: [L+1 over k, f * 2 * orders]."""
+    """Double Fourier coefficients of expansions, for even and for odd orders m: [f * 2 * orders, L+1 over k]."""
     l = np.arange(degree + 1, dtype=np.int32)
     m = l[:, None]
     positive = jnp.where((l >= m)[None], c[:, np.where(l >= m, l * l + l + m, 0)], 0)  # [f, m, l]
@@ -191,6 +188,6 @@ def _fourier(c: Float[Array, "f n"], degree: int) -> tuple[Array, Array]:
     both = jnp.stack([positive, negative], axis=1)
     scaled = _tables.polar_series(degree) * np.where(m == 0, 1, np.sqrt(2))[:, :, None]
     series = jnp.asarray(scaled, c.dtype)
-    even = jnp.einsum("mkl,fsml->kfsm", series[0::2], both[:, :, 0::2])
-    odd = jnp.einsum("mkl,fsml->kfsm", series[1::2], both[:, :, 1::2])
-    return even.reshape(degree + 1, -1), odd.reshape(degree + 1, -1)
+    even = jnp.einsum("mkl,fsml->fsmk", series[0::2], both[:, :, 0::2])
+    odd = jnp.einsum("mkl,fsml->fsmk", series[1::2], both[:, :, 1::2])
+    return even.reshape(-1, degree + 1), odd.reshape(-1, degree + 1)

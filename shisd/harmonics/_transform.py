@@ -38,8 +38,8 @@ def project_map(texels: ArrayLike, degree: int) -> Float[Array, "*colour n"]:
     Exact for a map band-limited to degree M when M < H and L + M < W. Of any other map, the coefficients are those of
     its trigonometric interpolant in the polar angle.
     Derivatives: linear in `texels`.
-    Accuracy: 3e-14 of the largest coefficient at degree 128 in float64, 3e-7 in float32.
-    Cost: 512 x 1024 at degree 16, 64, 128: 0.5, 0.6, 0.4 times ducc0 on the same cores.
+    Accuracy: 1e-13 of the largest coefficient at degree 128 in float64, 3e-7 in float32.
+    Cost: 512 x 1024 texels at degree 16, 64, 128: 0.4, 0.6, 0.8 times ducc0 in float64, 0.3, 0.4, 0.5 in float32.
     """
     texels, degree = _checks.real_array("texels", texels), _checks.degree(degree)
     if texels.ndim < 2 or 0 in texels.shape:
@@ -118,12 +118,15 @@ def synthesize(c: Float[Array, "f n"], rule: Rows, rows: int, columns: int) -> F
 @functools.partial(jax.jit, static_argnums=4)
 def _analyse(values: Array, azimuth: Array, polar: Array, series: Array, degree: int) -> Float[Array, "f n"]:
     rows, half = values.shape[0], polar.shape[2]
+    values = jnp.moveaxis(values, -1, 0)
     if jnp.iscomplexobj(azimuth):
-        bins = jnp.fft.rfft(jnp.moveaxis(values, -1, 0))[..., : azimuth.size]
+        bins = jnp.fft.rfft(values)[..., : azimuth.size]
         bins = jnp.pad(bins, ((0, 0), (0, 0), (0, azimuth.size - bins.shape[-1]))) * azimuth.reshape(1, 1, -1)
         orders = jnp.stack([bins.real, -bins.imag], axis=-1)
     else:
-        orders = jnp.einsum("jcf,cmr->fjmr", values, azimuth)
+        # As a plain matrix product: the same sum as an einsum is three times slower.
+        orders = values.reshape(-1, values.shape[-1]) @ azimuth.reshape(values.shape[-1], -1)
+        orders = orders.reshape(-1, rows, *azimuth.shape[1:])
     north, south = orders[:, :half], orders[:, rows - half :][:, ::-1]
     folded = jnp.stack([north + south, north - south]).reshape(2, -1, half, series.shape[2], 2, 2)  # even, odd in z
     even, odd = folded[..., 0, :], folded[..., 1, :]  # of the orders
@@ -146,9 +149,10 @@ def _synthesize(
     even = jnp.stack([paired[0, 0], paired[1, 1]], axis=-2)  # in z, by the parity q of the order
     odd = jnp.stack([paired[1, 0], paired[0, 1]], axis=-2)
     orders = jnp.concatenate([even + odd, (even - odd)[:, : rows // 2][:, ::-1]], axis=1)
-    orders = orders.reshape(c.shape[0], rows, 2 * n, 2)
+    orders = orders.reshape(-1, rows, 2 * n, 2)
     if not jnp.iscomplexobj(azimuth):
-        return jnp.einsum("fjmr,cmr->jcf", orders, azimuth)
+        values = orders.reshape(-1, 4 * n) @ azimuth.reshape(columns, -1).T
+        return jnp.moveaxis(values.reshape(-1, rows, columns), 0, -1)
     halves = jnp.where(np.arange(2 * n) == 0, columns, columns / 2).astype(azimuth.dtype)
     bins = jax.lax.complex(orders[..., 0], -orders[..., 1]) * (halves * jnp.conj(azimuth)).reshape(1, 1, -1)
     return jnp.moveaxis(jnp.fft.irfft(bins[..., : degree + 1], n=columns), 0, -1)

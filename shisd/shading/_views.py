@@ -66,7 +66,7 @@ def azimuth_factors(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array,
     sine = _sine(view)
     off = sine > 0
     safe = jnp.where(off, sine, 1)
-    cos, sin = (p.T for p in angle_multiples(jnp.where(off, x / safe, 1), y / safe, max(count - 1, 1)))
+    cos, sin = angle_multiples(jnp.where(off, x / safe, 1), y / safe, max(count - 1, 1))
     x, y = x[None], y[None]
     first = jnp.ones_like(x), jnp.zeros_like(x)
     rest = (x * cos - y * sin, x * sin + y * cos)  # (x, y) = sin(theta) (cos, sin)(phi)

@@ -55,7 +55,7 @@ def test_e3nn_as_it_printed(x64, rng):
     np.testing.assert_allclose(harmonics.evaluate(jnp.asarray(c), jnp.asarray(E3NN_DIRECTIONS)), there, atol=1e-13)
 
 
-@pytest.mark.parametrize("degree", (5, 30))
+@pytest.mark.parametrize("degree", (5, pytest.param(30, marks=pytest.mark.slow)))
 def test_e3nn_is_the_basis_with_permuted_axes(x64, rng, degree):
     """y_e3nn(x, y, z) = y_unsigned(z, x, y)."""
     c, w = rng.normal(size=(degree + 1) ** 2), directions(rng)
@@ -131,9 +131,7 @@ def test_gradients_jit_and_vmap(x64, rng):
 def test_errors_name_the_argument(as_user):
     c = np.ones(4, np.float32)
     for source, target, name in (("mitsuba", "shisd", "source"), ("shisd", "E3NN", "target")):
-        with pytest.raises(
-            ValueError, match=f"`{name}` must be one of 'shisd', 'sphericart'"
-        ):
+        with pytest.raises(ValueError, match=f"`{name}` must be one of 'shisd', 'sphericart'"):
             harmonics.convert(c, source, target)
     with pytest.raises(ValueError, match="`coefficients` must be complex"):
         harmonics.convert(c, "scipy", "shisd")

@@ -85,7 +85,7 @@ def test_zonal_basis_is_the_order_zero_column_of_the_basis(dtype, rng):
     np.testing.assert_allclose(got, harmonics.sh_basis(w, 12)[:, l * l + l], atol=tolerance)
 
 
-@pytest.mark.parametrize("degree", (5, 20))
+@pytest.mark.parametrize("degree", (5, pytest.param(20, marks=pytest.mark.slow)))
 def test_gradients(x64, degree):
     x = jnp.array([-1.0, -0.7, 0.0, 0.3, 1.0])
     check_grads(jax.jit(lambda x: harmonics.legendre(x, degree)), (x,), order=2, modes=("fwd", "rev"), eps=1e-6)

@@ -41,7 +41,7 @@ def test_windows_vanish_from_their_width_on():
 
 def test_windows_are_differentiable(x64):
     for window in (harmonics.hann_window, harmonics.lanczos_window, harmonics.laplacian_window):
-        check_grads(jax.jit(lambda w, window=window: window(4, w)), (jnp.asarray(5.3),), order=2, modes=("fwd", "rev"))
+        check_grads(jax.jit(lambda w, window=window: window(4, w)), (jnp.asarray(5.3),), order=1, modes=("fwd", "rev"))
 
 
 def test_apply_window_repeats_factors_over_orders(dtype, rng):
@@ -51,7 +51,9 @@ def test_apply_window_repeats_factors_over_orders(dtype, rng):
     np.testing.assert_allclose(got, np.asarray(c) * [1, 2, 2, 2, 3, 3, 3, 3, 3])
 
 
-@pytest.mark.parametrize("degree", (1, 4, 8))
+@pytest.mark.parametrize(
+    "degree", (3, pytest.param(1, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.slow))
+)
 def test_dering_reaches_the_floor_and_no_more(dtype, degree):
     c = spikes(degree, dtype)
     mean = float(c[0]) / np.sqrt(4 * np.pi)
@@ -69,44 +71,44 @@ def test_dering_reaches_the_floor_and_no_more(dtype, degree):
 
 def test_dering_is_exact_where_the_minimum_is_known(dtype):
     """f = 1 + 3 z: the lowest point is the pole -z, where 1 - 3 / (1 + 4 s) = 0."""
-    c = jnp.asarray([np.sqrt(4 * np.pi), 0, 3 * np.sqrt(4 * np.pi / 3), 0], dtype)
+    c = jnp.zeros(16, dtype).at[0].set(np.sqrt(4 * np.pi)).at[2].set(3 * np.sqrt(4 * np.pi / 3))
     result = harmonics.dering(c)
     np.testing.assert_allclose(result.strength, 0.5, rtol=LOW[dtype.name])
 
 
-def test_dering_leaves_what_is_above_the_floor_alone(dtype):
-    c = jnp.asarray([4.0, 0.1, -0.2, 0.3], dtype)
+def test_dering_leaves_what_is_above_the_floor_alone(x64):
+    c = jnp.zeros(16).at[:4].set(jnp.asarray([4.0, 0.1, -0.2, 0.3]))
     result = harmonics.dering(c)
     assert result.strength == 0
     np.testing.assert_array_equal(result.coefficients, c)
-    gradient = jax.grad(lambda c: harmonics.dering(c).coefficients[3] + harmonics.dering(c).strength)(c)
-    np.testing.assert_allclose(gradient, [0, 0, 0, 1])
+    gradient = jax.grad(lambda c: harmonics.dering(c).coefficients[3:].sum())(c)
+    np.testing.assert_allclose(gradient, np.arange(16) >= 3)
 
 
-def test_dering_treats_each_expansion_of_a_batch_by_itself(dtype):
-    c = jnp.stack([spikes(3, dtype), jnp.zeros(16, dtype).at[0].set(1), 2 * spikes(3, dtype)])[:, None]
+def test_dering_treats_each_expansion_of_a_batch_by_itself(x64):
+    c = jnp.stack([spikes(3, np.float64), jnp.zeros(16).at[0].set(1), 2 * spikes(3, np.float64)])[:, None]
     result = harmonics.dering(c)
     assert result.coefficients.shape == (3, 1, 16)
     assert result.strength.shape == (3, 1)
     assert result.strength[1, 0] == 0
-    np.testing.assert_allclose(result.strength[0], result.strength[2], rtol=LOW[dtype.name])
-    np.testing.assert_allclose(result.strength[0, 0], harmonics.dering(c[0, 0]).strength, rtol=LOW[dtype.name])
+    np.testing.assert_allclose(result.strength[0], result.strength[2], rtol=1e-9)
+    np.testing.assert_allclose(result.strength[0, 0], harmonics.dering(c[0, 0]).strength, rtol=1e-9)
 
 
 def test_no_window_helps_a_mean_below_the_floor(dtype):
-    c = jnp.asarray([-1.0, 0.1, 0, 0], dtype)
+    c = jnp.zeros(16, dtype).at[0].set(-1).at[1].set(0.1)
     with pytest.raises(Exception, match="above its own mean"):
         harmonics.dering(c)
     result = harmonics.dering(c, throw=False)
     assert result.strength == np.inf
-    np.testing.assert_allclose(result.coefficients, [-1, 0, 0, 0])
+    np.testing.assert_array_equal(result.coefficients, c.at[1].set(0))
     assert bool(result.status == harmonics.WindowStatus.mean_below_floor)
     nan = harmonics.dering(c.at[2].set(np.nan), throw=False)
     assert bool(nan.status == harmonics.WindowStatus.mean_below_floor)
 
 
 def test_derivatives_of_dering_are_those_of_the_implicit_function(x64, rng):
-    c = spikes(4, np.float64)
+    c = spikes(3, np.float64)
     v = jnp.asarray(rng.normal(size=c.shape))
     both = jax.jit(lambda c, floor: harmonics.dering(c, floor=floor)[:2])
     floor = jnp.asarray(0.01)
@@ -121,12 +123,13 @@ def test_derivatives_of_dering_are_those_of_the_implicit_function(x64, rng):
     np.testing.assert_allclose(gradient @ v, forward, rtol=1e-10)
 
 
-def test_jit_and_vmap_agree_with_the_plain_call(dtype):
-    c = jnp.stack([spikes(3, dtype), spikes(3, dtype)[::-1].at[0].set(1)])
+@pytest.mark.slow
+def test_jit_and_vmap_agree_with_the_plain_call(x64):
+    c = jnp.stack([spikes(3, np.float64), spikes(3, np.float64)[::-1].at[0].set(1)])
     plain = harmonics.dering(c)
-    np.testing.assert_allclose(jax.jit(harmonics.dering)(c).strength, plain.strength, rtol=LOW[dtype.name])
+    np.testing.assert_allclose(jax.jit(harmonics.dering)(c).strength, plain.strength, rtol=1e-9)
     vmapped = jax.vmap(lambda c: harmonics.dering(c).strength)(c)
-    np.testing.assert_allclose(vmapped, plain.strength, rtol=LOW[dtype.name])
+    np.testing.assert_allclose(vmapped, plain.strength, rtol=1e-9)
 
 
 def test_errors_name_the_argument(as_user):
