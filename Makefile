@@ -21,17 +21,18 @@ demo: $(VENV)/.demo
 	$(RUN) examples/relight.py --output output/relight --overwrite
 
 test: $(VENV)/.test
-	$(RUN) -m pytest -m "not slow"
+	$(RUN) -m pytest -n 2 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.test
-	$(RUN) -m pytest -m slow
+	$(RUN) -m pytest -n 2 --dist loadfile -m slow
 
 lint: $(VENV)/.test
 	$(RUN) -m ruff check .
 	$(RUN) -m pyright --pythonpath $(RUN)
 
 bench: $(VENV)/.test
-	$(RUN) -m tests.bench.run
+	MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000 \
+	  $(RUN) -m tests.bench.run --readme
 
 clean:
 	rm -rf $(VENV) output

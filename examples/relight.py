@@ -125,8 +125,8 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
 
     with ThreadPoolExecutor(2) as pool:
         truths = dict(zip(jobs, tqdm(pool.map(integrate, jobs), "Monte Carlo", len(jobs)), strict=True))
-        lobes = dict(zip(brdfs, tqdm(pool.map(tabulate, brdfs.values()), "lobes", len(brdfs)), strict=True))
 
+    lobes = {name: tabulate(brdf) for name, brdf in tqdm(brdfs.items(), "lobes")}
     cases = list(itertools.product(brdfs, environments, degrees))
 
     def shade(case):
@@ -134,15 +134,15 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
         return shading.shade_environment(lobes[material], coefficients[light, degree], normals, views)
 
     coefficients = {(name, d): environments[name].coefficients(d) for name in environments for d in degrees}
-    with ThreadPoolExecutor(2) as pool:  # compiles each degree once
-        images = {k: np.asarray(v, float) for k, v in zip(cases, tqdm(pool.map(shade, cases), "shading", len(cases)), strict=True)}
-    rows = []
-    for material, light, degree in tqdm(cases, "timing"):
+    images, rows = {}, []
+    for case in tqdm(cases, "shading"):
+        images[case] = np.asarray(shade(case), float)  # the first of each degree compiles
+        material, light, degree = case
         row = {"material": material, "map": light, "degree": degree}
         for shape, pixels in part.items():
             truth, bar = (a[pixels] for a in truths[material, light])
-            row[f"{shape} error"], row[f"{shape} noise"] = compare(images[material, light, degree][pixels], truth, bar)
-        rows.append({**row, "us/pixel": 1e6 * best_time(shade, (material, light, degree)) / len(normals)})
+            row[f"{shape} error"], row[f"{shape} noise"] = compare(images[case][pixels], truth, bar)
+        rows.append({**row, "us/pixel": 1e6 * best_time(shade, case) / len(normals)})
 
     gallery = []  # every object, room and material at the highest degree
     for shape, light in tqdm(list(itertools.product(shapes, environments)), "pictures"):

@@ -15,15 +15,15 @@ class Timing:
     best: float  # s
 
 
-def interleaved(methods: dict[str, Callable], *arguments, seconds: float = 2.0, rounds: int = 30) -> dict[str, Timing]:
-    """Call every method once, then all of them in turn until the time is used up; at least five rounds."""
+def interleaved(methods: dict[str, Callable], *arguments, seconds: float = 1.0, rounds: int = 30) -> dict[str, Timing]:
+    """Call every method twice, then all of them in turn until the time is used up; at least three rounds."""
     first, runs = {}, {name: [] for name in methods}
     for name, method in methods.items():
         first[name] = _time(method, arguments)
         _time(method, arguments)
     start = time.perf_counter()
     for i in range(rounds):
-        if i >= 5 and time.perf_counter() - start > seconds * len(methods):
+        if i >= 3 and time.perf_counter() - start > seconds * len(methods):
             break
         for name, method in methods.items():
             runs[name].append(_time(method, arguments))
