@@ -46,19 +46,24 @@ def _rotate(c: Float[Array, "*batch n"], r: Float[Array, "3 3"], degree: int) ->
     handed = jnp.dot(jnp.cross(r[:, 0], r[:, 1]), r[:, 2])
     bad = ~(jnp.all(drift < 1e-3) & (handed > 0))
     r = eqx.error_if(r, bad, "`rotation` must be orthonormal with determinant +1 (R^T R = 1, right-handed).")
-    return rotate_many(c.reshape(-1, c.shape[-1]), r[None], degree)[..., 0].reshape(c.shape)
+    return rotate_many(c.reshape(-1, c.shape[-1]), r[None], degree)[..., 0].T.reshape(c.shape)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
-def rotate_many(c: Float[Array, "f n"], r: Float[Array, "p 3 3"], degree: int) -> Float[Array, "f n p"]:
-    """Every expansion rotated by every matrix, without a check. Rotations stand last: they are the vector lanes."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
+def rotate_many(
+    c: Float[Array, "f n"], r: Float[Array, "p 3 3"], degree: int, upright: bool = False
+) -> Float[Array, "n f p"]:
+    """Every expansion rotated by every matrix, without a check. Rotations stand last: they are the vector lanes.
+
+    `upright` promises that R z has y = 0 <= x, so that a = 0 and the last turn is left out.
+    """
     a, b, g = _turns(r, degree)
-    return _finish(_swap_turned(c, *g, degree), a, b, degree)
+    return _finish(_swap_turned(c, *g, degree), None if upright else a, b, degree)
 
 
-def _rotate_many_jvp(degree, primals, tangents):
+def _rotate_many_jvp(degree, upright, primals, tangents):
     (c, r), (dc, dr) = primals, tangents
-    x = rotate_many(c, r, degree)
+    x = rotate_many(c, r, degree, upright)
     dx = jnp.zeros_like(x)
     if not isinstance(dc, SymbolicZero):
         dx += _rotate_many_away_from_pole(dc, r, degree)
@@ -67,7 +72,7 @@ def _rotate_many_jvp(degree, primals, tangents):
         rates = (rate[:, 2, 1] - rate[:, 1, 2], rate[:, 0, 2] - rate[:, 2, 0], rate[:, 1, 0] - rate[:, 0, 1])
         for w, terms in zip(rates, _tables.generator_gather(degree), strict=True):
             for index, factor in terms:
-                dx += jnp.asarray(factor[:, None], x.dtype)[None] * (w / 2)[None, None] * x[:, index]
+                dx += jnp.asarray(factor[:, None, None], x.dtype) * (w / 2)[None, None] * x[index]
     return x, dx
 
 
@@ -83,7 +88,7 @@ def _rotate_many_away_from_pole(c: Float[Array, "f n"], r: Float[Array, "p 3 3"]
     near = r[:, 2, 2] ** 2 > 0.5
     a, b, g = _turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
     flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[None], c.dtype)
-    quartered = _swap(c[..., None], degree)[..., 0] * flip
+    quartered = _swap(c.T[..., None], degree)[..., 0].T * flip
     x = jnp.where(near[None, None], _swap_turned(quartered, *g, degree), _swap_turned(c, *g, degree))
     return _finish(x, a, b, degree)
 
@@ -93,10 +98,11 @@ def _turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
     return [list(angle_multiples(cos, sin, degree + 1)) for cos, sin in _angles(r)]
 
 
-def _finish(x: Float[Array, "f n p"], a: list[Array], b: list[Array], degree: int) -> Float[Array, "f n p"]:
+def _finish(x: Float[Array, "n f p"], a: list[Array] | None, b: list[Array], degree: int) -> Float[Array, "n f p"]:
     """Z(a) J Z(-b) of x: the turn about y is J Z(-b) J, whose first exchange is already in x."""
     cos_b, sin_b = b
-    return _turn(_swap(_turn(x, cos_b, -sin_b, degree), degree), *a, degree)
+    x = _swap(_turn(x, cos_b, -sin_b, degree), degree)
+    return x if a is None else _turn(x, *a, degree)
 
 
 def _angles(r: Float[Array, "p 3 3"]) -> tuple[tuple[Array, Array], tuple[Array, Array], tuple[Array, Array]]:
@@ -109,30 +115,31 @@ def _angles(r: Float[Array, "p 3 3"]) -> tuple[tuple[Array, Array], tuple[Array,
     return (cos_a, sin_a), (cos_b, sin_b), (cos_b * x - sin_b * r[:, 2, 0], y)
 
 
-def _turn(x: Float[Array, "f n p"], cos: Array, sin: Array, degree: int) -> Float[Array, "f n p"]:
+def _turn(x: Float[Array, "n f p"], cos: Array, sin: Array, degree: int) -> Float[Array, "n f p"]:
     """The turn about z whose multiples have these cosines and sines [L+1, p]."""
     m, l = _tables.orders(degree), _tables.bands(degree)
     sign = jnp.asarray(-np.sign(m)[:, None], x.dtype)
-    return cos[np.abs(m)][None] * x + (sign * sin[np.abs(m)])[None] * x[:, l * l + l - m]
+    return cos[np.abs(m)][:, None] * x + (sign * sin[np.abs(m)])[:, None] * x[l * l + l - m]
 
 
-def _swap(x: Float[Array, "f n p"], degree: int) -> Float[Array, "f n p"]:
+def _swap(x: Float[Array, "n f p"], degree: int) -> Float[Array, "n f p"]:
     """y and z exchanged: J_l on every band."""
     bands = [
-        jnp.einsum("ij,fjp->fip", jnp.asarray(j, x.dtype), x[:, l * l : (l + 1) ** 2])
+        jnp.tensordot(jnp.asarray(j, x.dtype), x[l * l : (l + 1) ** 2], 1)
         for l, j in enumerate(_tables.swap_matrices(degree))
     ]
-    return jnp.concatenate(bands, axis=1)
+    return jnp.concatenate(bands)
 
 
-def _swap_turned(c: Float[Array, "f n"], cos: Array, sin: Array, degree: int) -> Float[Array, "f n p"]:
+def _swap_turned(c: Float[Array, "f n"], cos: Array, sin: Array, degree: int) -> Float[Array, "n f p"]:
     """`_swap` of `_turn` of coefficients that all rotations share: one product with the cosines and sines."""
     cosine, sine = [], []
     for l, j in enumerate(_tables.swap_matrices(degree)):
-        plus, minus = c[:, None, l * l + l : (l + 1) ** 2], c[:, None, l * l : l * l + l + 1][..., ::-1]
-        j_plus = jnp.asarray(j[None, :, l:], c.dtype)
-        j_minus = jnp.asarray(j[None, :, l::-1] * (np.arange(l + 1) > 0), c.dtype)  # m = 0 counts once
+        plus, minus = c[None, :, l * l + l : (l + 1) ** 2], c[None, :, l * l : l * l + l + 1][..., ::-1]
+        j_plus = jnp.asarray(j[:, None, l:], c.dtype)
+        j_minus = jnp.asarray(j[:, None, l::-1] * (np.arange(l + 1) > 0), c.dtype)  # m = 0 counts once
         pad = ((0, 0), (0, 0), (0, degree - l))
         cosine.append(jnp.pad(j_plus * plus + j_minus * minus, pad))
         sine.append(jnp.pad(j_minus * plus - j_plus * minus, pad))
-    return jnp.concatenate(cosine, axis=1) @ cos + jnp.concatenate(sine, axis=1) @ sin
+    series = jnp.concatenate([jnp.concatenate(cosine), jnp.concatenate(sine)], axis=-1)  # [n, f, 2 (L+1)]
+    return jnp.tensordot(series, jnp.concatenate([cos, sin]), 1)

@@ -85,11 +85,11 @@ def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) 
     def shade_tile(tile: tuple[Array, ...]) -> Float[Array, "p *colour"]:
         normal, view, *tangent = (normalize(a) for a in tile)
         r = _frame(normal) if lobes.isotropic else _tangent_frame(normal, tangent[0])
-        light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(r, 1, 2), degree)
+        light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(r, 1, 2), degree, lobes.isotropic)
         local = jnp.einsum("pij,pi->pj", r, view)
-        slices = slice_values(table, local, lobes)
-        shape = (*colour, *light.shape[1:])
-        light = light.reshape(*e.shape[:-1], *light.shape[1:])
+        slices = slice_values(table, local, lobes)  # [*colour, n, p]
+        light = jnp.moveaxis(light.reshape(light.shape[0], *e.shape[:-1], _TILE), 0, -2)
+        shape = (*colour, *light.shape[-2:])
         radiance = jnp.sum(jnp.broadcast_to(slices, shape) * jnp.broadcast_to(light, shape), axis=-2)
         return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(radiance, -1, 0))
 
@@ -101,7 +101,7 @@ def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) 
 
 @jax.custom_jvp
 def _frame(normal: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
-    """R = Rz(a) Ry(b) with R z = n, for isotropic materials, which do not mind any further turn about n.
+    """R with R z = n and R^T z = (sin, 0, cos), for isotropic materials, which do not mind a turn about n.
 
     No choice of such frames is smooth everywhere. But what they are used for does not depend on the choice, so its
     derivative may follow any: the frame that turns no more than the normal does, about n x dn.
@@ -110,7 +110,7 @@ def _frame(normal: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
     rho = jnp.sqrt(x * x + y * y)
     safe = jnp.where(rho > 0, rho, 1)
     cos, sin, zero = jnp.where(rho > 0, x / safe, 1), y / safe, jnp.zeros_like(x)
-    rows = [[cos * z, -sin, x], [sin * z, cos, y], [-rho, zero, z]]
+    rows = [[-cos * z, sin, x], [-sin * z, -cos, y], [rho, zero, z]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
