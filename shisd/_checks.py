@@ -14,7 +14,7 @@ from shisd._typing import Array
 
 
 def real_array(name: str, value: ArrayLike) -> Array:
-    """`value` as a floating JAX array: float32 and float64 stay as they are, Python and NumPy integers become floats."""
+    """`value` as a floating JAX array: float32 and float64 stay, integers become floats."""
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:

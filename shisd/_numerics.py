@@ -13,7 +13,7 @@ def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
 
 def angle_multiples(
     cos: Float[Array, "*batch"], sin: Float[Array, "*batch"], count: int
-) -> tuple[Float[Array, "{count} *batch"], Float[Array, "{count} *batch"]]:
+) -> tuple[Float[Array, " {count} *batch"], Float[Array, " {count} *batch"]]:
     """cos(k a) and sin(k a) for k = 0 ... count-1 on a new first axis, from cos(a) and sin(a).
 
     Powers of a unit complex number as products of two short tables, a few of them at once: k = giant * i + baby. Every

@@ -1,7 +1,7 @@
 """Rotation of expansions by matrices: (R f)(w) = f(R^T w).
 
-A rotation is a turn about z, one about y, one about z; the turn about y is one about z between two exchanges of y and z.
-On coefficients, turns about z mix m with -m and the exchange is the constant matrix J_l of each band ("Z J Z J Z").
+A rotation is a turn about z, one about y, one about z; the turn about y is one about z between two exchanges of y and
+z. On coefficients, turns about z mix m with -m and the exchange is the constant matrix J_l of each band ("Z J Z J Z").
 The angles enter only through their cosines and sines and never leave this file. They are not smooth where the pole
 stays in place, but the result is: its derivative is taken from the generators of rotation, which need no angle.
 
@@ -26,8 +26,8 @@ from shisd.harmonics import _tables
 def rotate(coefficients: ArrayLike, rotation: ArrayLike) -> Float[Array, "*batch n"]:
     """Coefficients of the rotated expansion (R f)(w) = f(R^T w).
 
-    Arguments: `coefficients` [..., (L+1)^2]; `rotation` [3, 3], orthonormal with determinant +1 (a matrix that is not, by
-    more than 1e-3, raises; batch it with jax.vmap).
+    Arguments: `coefficients` [..., (L+1)^2]; `rotation` [3, 3], orthonormal with determinant +1 (a matrix that is not,
+    by more than 1e-3, raises; batch it with jax.vmap).
     Derivatives: in both arguments, every order, both modes, exact at the identity and wherever the pole stays in place.
     In `rotation` they are taken along the group of rotations: the part of a tangent that leaves it has no effect.
     Accuracy: 1e-12 at degree 100 in float64, 1e-5 in float32, relative to the largest coefficient of the band.
@@ -57,8 +57,8 @@ def rotate_many(
 
     `upright` promises that R z has y = 0 <= x, so that a = 0 and the last turn is left out.
     """
-    a, b, g = _turns(r, degree)
-    return _finish(_swap_turned(c, *g, degree), None if upright else a, b, degree)
+    a, b, (cos_g, sin_g) = _turns(r, degree)
+    return _finish(_swap_turned(c, cos_g, sin_g, degree), None if upright else a, b, degree)
 
 
 def _rotate_many_jvp(degree, upright, primals, tangents):
@@ -86,10 +86,11 @@ def _rotate_many_away_from_pole(c: Float[Array, "f n"], r: Float[Array, "p 3 3"]
     """
     quarter = jnp.asarray([[1, 0, 0], [0, 0, -1], [0, 1, 0]], r.dtype)
     near = r[:, 2, 2] ** 2 > 0.5
-    a, b, g = _turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
+    a, b, (cos_g, sin_g) = _turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
     flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[None], c.dtype)
     quartered = _swap(c.T[..., None], degree)[..., 0].T * flip
-    x = jnp.where(near[None, None], _swap_turned(quartered, *g, degree), _swap_turned(c, *g, degree))
+    turned = (_swap_turned(x, cos_g, sin_g, degree) for x in (quartered, c))
+    x = jnp.where(near[None, None], *turned)
     return _finish(x, a, b, degree)
 
 
@@ -102,7 +103,7 @@ def _finish(x: Float[Array, "n f p"], a: list[Array] | None, b: list[Array], deg
     """Z(a) J Z(-b) of x: the turn about y is J Z(-b) J, whose first exchange is already in x."""
     cos_b, sin_b = b
     x = _swap(_turn(x, cos_b, -sin_b, degree), degree)
-    return x if a is None else _turn(x, *a, degree)
+    return x if a is None else _turn(x, a[0], a[1], degree)
 
 
 def _angles(r: Float[Array, "p 3 3"]) -> tuple[tuple[Array, Array], tuple[Array, Array], tuple[Array, Array]]:

@@ -32,9 +32,9 @@ def sh_basis(directions: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
     Arguments: `directions` [..., 3], of any length (only the direction counts; a zero vector gives NaN); static
     `degree` L >= 0. Returns [..., (L+1)^2] in the dtype of `directions`, index l*(l+1)+m.
     Derivatives: in `directions`, every order, both modes, exact at the poles.
-    Accuracy: 1e-13 at degree 30 and 1e-12 at degree 100 in float64; 3e-6 at degree 16 and 3e-5 at degree 100 in float32.
-    Cost: a matrix product with L+1 columns per two coefficients; the result is (L+1)^2 numbers per direction, so to
-    evaluate an expansion use `evaluate`.
+    Accuracy: 1e-13 at degree 30 and 1e-12 at degree 100 in float64; 3e-6 at degree 16 and 3e-5 at degree 100 in
+    float32. Cost: a matrix product with L+1 columns per two coefficients; the result is (L+1)^2 numbers per direction,
+    so to evaluate an expansion use `evaluate`.
     Source: ISD15 Eq. 7, ISD15s Eq. 3-5.
     """
     degree = _checks.degree(degree)
@@ -121,7 +121,7 @@ def _basis_jvp(degree, primals, tangents):
 
 @functools.cache
 def _basis_tables(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Polar series of every coefficient over cos, then sin(k theta); and the map from cos, then sin(m phi) to the orders."""
+    """Polar series of every coefficient over cos, then sin(k theta); map from cos, then sin(m phi) to the orders."""
     m = _tables.orders(degree)
     table = _tables.polar_series(degree)[np.abs(m), :, _tables.bands(degree)].T * np.where(m == 0, 1, np.sqrt(2))
     series = np.concatenate([np.where(m % 2 == 0, table, 0), np.where(m % 2 == 1, table, 0)])

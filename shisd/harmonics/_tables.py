@@ -5,6 +5,7 @@ y_l^m = sqrt(2) p[l, m] cos(m phi), p[l, 0], sqrt(2) p[l, m] sin(m phi) for orde
 """
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +14,7 @@ Gather = tuple[tuple[np.ndarray, np.ndarray], ...]
 
 @functools.cache
 def recurrence(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Factors of ISD15s Eq. 4 and 5: p[m, m] = s[m] sin p[m-1, m-1], p[l, m] = a[l, m] cos p[l-1, m] - b[l, m] p[l-2, m].
+    """Factors of ISD15s Eq. 4, 5: p[m, m] = s[m] sin p[m-1, m-1], p[l, m] = a[l, m] cos p[l-1, m] - b[l, m] p[l-2, m].
 
     a[m+1, m] = sqrt(2m + 3) with b[m+1, m] = 0 is the second line of Eq. 4 in the form of Eq. 5.
     """
@@ -80,14 +81,14 @@ def polar_series(degree: int) -> np.ndarray:
 
 
 @functools.cache
-def gradient_terms(degree: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
+def gradient_terms(degree: int) -> tuple[list[tuple[int, int, float]], ...]:
     """The gradient of r^l y_l^m as a combination of y_(l-1): (row, column, factor) of the nonzero entries, for x, y, z.
 
     row is the index of (l, m), column that of (l-1, m'). From (d_x +- i d_y) r^l Y_l^m = +-k sqrt((l -+ m)(l -+ m - 1))
     r^(l-1) Y_(l-1)^(m +- 1) and d_z r^l Y_l^m = k sqrt(l^2 - m^2) r^(l-1) Y_(l-1)^m with k^2 = (2l+1)/(2l-1)
     (Hobson 1931, 89; checked against finite differences in the tests).
     """
-    terms = ([], [], [])
+    terms: tuple[list, ...] = ([], [], [])
 
     def add(axis: int, l: int, m: int, m_from: int, factor: float) -> None:
         if abs(m_from) < l and factor:
@@ -114,24 +115,18 @@ def gradient_terms(degree: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarra
             add(0, l, -m, -m - 1, up)
             add(1, l, m, -m - 1, up)
             add(1, l, -m, m + 1, -up)
-    return tuple(
-        (
-            np.array([t[0] for t in axis], int),
-            np.array([t[1] for t in axis], int),
-            np.array([t[2] for t in axis], float),
-        )
-        for axis in terms
-    )
+    return terms
 
 
 @functools.cache
 def gradient_gather(degree: int, transpose: bool) -> tuple[Gather, ...]:
     """`gradient_terms` for x, y, z over the rows (or, transposed, over the columns)."""
     size = degree * degree if transpose else (degree + 1) ** 2
-    return tuple(
-        _gather(column, row, factor, size) if transpose else _gather(row, column, factor, size)
-        for row, column, factor in gradient_terms(degree)
-    )
+    gathers = []
+    for axis in gradient_terms(degree):
+        row, column, factor = [t[0] for t in axis], [t[1] for t in axis], [t[2] for t in axis]
+        gathers.append(_gather(column, row, factor, size) if transpose else _gather(row, column, factor, size))
+    return tuple(gathers)
 
 
 @functools.cache
@@ -166,12 +161,11 @@ def generator_gather(degree: int) -> tuple[Gather, ...]:
             add(0, l, m + 1, -m, -a)
             add(1, l, m + 1, m, -a)
             add(1, l, -m - 1, -m, -a)
-    return tuple(
-        _gather(*(np.array(column) for column in zip(*axis, strict=True)), (degree + 1) ** 2) for axis in terms
-    )
+    size = (degree + 1) ** 2
+    return tuple(_gather([t[0] for t in axis], [t[1] for t in axis], [t[2] for t in axis], size) for axis in terms)
 
 
-def _gather(target: np.ndarray, source: np.ndarray, factor: np.ndarray, size: int) -> Gather:
+def _gather(target: Sequence[int], source: Sequence[int], factor: Sequence[float], size: int) -> Gather:
     """A sparse matrix as (index, factor) pairs: (A v)[i] = sum over pairs of factor[i] * v[index[i]]."""
     pairs: list[tuple[np.ndarray, np.ndarray]] = []
     filled = np.zeros(size, int)
@@ -189,7 +183,8 @@ def swap_matrices(degree: int) -> tuple[np.ndarray, ...]:
     """J_l of every band: y_l(x, z, y) = J_l y_l(x, y, z). Symmetric, orthogonal, its own inverse.
 
     From Wigner's d(pi/2), by its recurrence in degree at fixed orders (Varshalovich et al. 1988, 4.8.2, at cos = 0),
-    since the swap is the quarter turn about x followed by y -> -y, and a turn about x is one about y seen from Rz(pi/2).
+    since the swap is the quarter turn about x followed by y -> -y, and a turn about x is one about y seen from
+    Rz(pi/2).
     """
     m = np.arange(-degree, degree + 1)
     row, column = np.meshgrid(m, m, indexing="ij")

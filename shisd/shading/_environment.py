@@ -1,9 +1,10 @@
 """Radiance from distant light: ISD15 Eq. 22 for batches of normals and views.
 
-Eq. 22 sums, over rotated axes R z_k and bands, the lobe weights times the light convolved with that band's zonal harmonic.
-By the addition theorem this is the product of the lobe's coefficients with the light's coefficients in the local frame.
-On a CPU the latter is fastest: turning the light is two products with constant matrices, shared by every lobe axis, where
-Eq. 22 as it stands evaluates (L+1)^2 harmonics at 2L+1 axes per pixel. tests/bench compares the candidates.
+Eq. 22 sums, over rotated axes R z_k and bands, the lobe weights times the light convolved with that band's zonal
+harmonic. By the addition theorem this is the product of the lobe's coefficients with the light's coefficients in the
+local frame. On a CPU the latter is fastest: turning the light is two products with constant matrices, shared by every
+lobe axis, where Eq. 22 as it stands evaluates (L+1)^2 harmonics at 2L+1 axes per pixel. tests/bench compares the
+candidates.
 
 notation: R = (t, b, n) local to world; e = light coefficients; R^T e = light in the local frame.
 """
@@ -32,14 +33,14 @@ def shade_environment(
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under distant light (ISD15 Eq. 22).
 
-    Arguments: `lobes` from `tabulate_brdf`; `light_coefficients` [*colour, n], SH coefficients of the incident radiance in
-    world space; `normals` and `views` [..., 3] in world space, of any length, pointing away from the surface; `tangents`
-    [..., 3], the local x axis of anisotropic materials (needed for these, ignored for others; only its part along the
-    surface counts). Colours of lobes and light broadcast: scalar or RGB. Bands that only one of the two has add nothing.
-    Returns [..., *colour] in W/(m2 sr), or the light's unit. A view below the horizon gives 0; a zero or NaN normal or
-    view gives NaN.
-    Derivatives: in every floating argument, both modes, any order; smooth where a view lies along its normal and where a
-    normal lies along any axis of the world. The cut at the horizon is a discontinuity of the view, with no gradient.
+    Arguments: `lobes` from `tabulate_brdf`; `light_coefficients` [*colour, n], SH coefficients of the incident
+    radiance in world space; `normals` and `views` [..., 3] in world space, of any length, pointing away from the
+    surface; `tangents` [..., 3], the local x axis of anisotropic materials (needed for these, ignored for others; only
+    its part along the surface counts). Colours of lobes and light broadcast: scalar or RGB. Bands that only one of the
+    two has add nothing. Returns [..., *colour] in W/(m2 sr), or the light's unit. A view below the horizon gives 0; a
+    zero or NaN normal or view gives NaN.
+    Derivatives: in every floating argument, both modes, any order; smooth where a view lies along its normal and where
+    a normal lies along any axis of the world. The cut at the horizon is a discontinuity of the view, with no gradient.
     Accuracy: Eq. 22 to 1e-5 in float32 and 1e-12 in float64, relative to the largest radiance.
     Cost: about L^3 products per pixel. Memory: one tile of 128 pixels, and the result; the same with gradients.
     Source: ISD15 Eq. 20-22.
@@ -73,7 +74,7 @@ def shade_environment(
 
 
 @eqx.filter_jit
-def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) -> Float[Array, "p *colour"]:
+def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) -> Float[Array, " p *colour"]:
     degree = int(np.sqrt(e.shape[-1])) - 1
     table = lookup_table(lobes, degree)
     colour = np.broadcast_shapes(lobes.colour, e.shape[:-1])
@@ -82,7 +83,7 @@ def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) 
     fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * _TILE - count, 3))]).reshape(tiles, _TILE, 3)
 
     @jax.checkpoint
-    def shade_tile(tile: tuple[Array, ...]) -> Float[Array, "p *colour"]:
+    def shade_tile(tile: tuple[Array, ...]) -> Float[Array, " p *colour"]:
         normal, view, *tangent = (normalize(a) for a in tile)
         r = _frame(normal) if lobes.isotropic else _tangent_frame(normal, tangent[0])
         light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(r, 1, 2), degree, lobes.isotropic)

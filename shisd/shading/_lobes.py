@@ -1,4 +1,4 @@
-"""Materials as weights on rotated zonal harmonics: cosine-weighted view slices over local view directions (ISD15 Eq. 21).
+"""Materials as weights on rotated zonal harmonics: cosine-weighted slices over local view directions (ISD15 Eq. 21).
 
 The slices are integrated in polar coordinates about the mirror direction, graded to the width of the lobe, up to the
 horizon exactly: a fixed number of nodes serves every roughness, and the cut of max(cos, 0) costs no accuracy.
@@ -8,6 +8,7 @@ a = the unit vector at r that points up, b = horizontal; w is above the horizon 
 """
 
 import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -61,7 +62,7 @@ class Lobes(eqx.Module):
 
 
 def lookup_table(lobes: Lobes, degree: int | None = None) -> Float[Array, "*colour n columns"]:
-    """What `slice_values` looks up, for coefficients up to `degree`: splines in elevation times Fourier series in azimuth.
+    """What `slice_values` looks up, up to `degree`: splines in elevation times Fourier series in azimuth.
 
     Columns: V+4 spline coefficients; for anisotropic materials, that for every cosine, then every sine component.
     """
@@ -114,9 +115,9 @@ def tabulate_brdf(
 
     Arguments: `brdf`; the `basis` to decompose into. Static: `views`, elevations of the table, at least 4; `azimuths`,
     even, for anisotropic materials only; `quadrature`, nodes from the mirror direction to the horizon (and half as many
-    in each eighth of a turn about it), by default 32 + degree. Every slice is integrated again with three quarters of the nodes: where that
-    changes a coefficient by more than `tolerance` of the largest one, the table is an error at run time that says so;
-    `throw=False` leaves it to the caller, in `Lobes.quadrature_error`.
+    in each eighth of a turn about it), by default 32 + degree. Every slice is integrated again with three quarters of
+    the nodes: where that changes a coefficient by more than `tolerance` of the largest one, the table is an error at
+    run time that says so; `throw=False` leaves it to the caller, in `Lobes.quadrature_error`.
     Derivatives: in every parameter of the material and in the lobe directions, both modes. The nodes follow
     `brdf.lobe_width`, through which no derivative passes.
     Accuracy: `quadrature_error` below 1e-4 for GGX down to alpha 0.05 at the default quadrature, in float32.
@@ -164,8 +165,8 @@ def _tabulate(
         c = eqx.error_if(
             c,
             ~(error <= tolerance),
-            "The quadrature does not resolve this material: a coarser rule differs by more than `tolerance`. Pass a larger "
-            "`quadrature`, or throw=False and read `quadrature_error`.",
+            "The quadrature does not resolve this material: a coarser rule differs by more than `tolerance`. "
+            "Pass a larger `quadrature`, or throw=False and read `quadrature_error`.",
         )
     return Lobes(basis, basis.weights(c), error, brdf.isotropic)
 
@@ -187,9 +188,9 @@ def _nodes(
 ) -> tuple[Float[Array, "nodes 3"], Float[Array, " nodes"]]:
     """Directions above the horizon and their solid angles, graded towards the mirror direction of `view`.
 
-    psi = width sinh(s), which resolves the lobe and its tails alike. In chi, panels of an eighth of a turn are graded to
-    the end near the plane of incidence, where lobes at grazing views are thin, or near the horizon's turning point, where
-    psi_max changes over an angle cos(theta_o).
+    psi = width sinh(s), which resolves the lobe and its tails alike. In chi, panels of an eighth of a turn are graded
+    to the end near the plane of incidence, where lobes at grazing views are thin, or near the horizon's turning point,
+    where psi_max changes over an angle cos(theta_o).
     """
     cos_o = view[2]
     sin_o = jnp.sqrt(1 - cos_o * cos_o)

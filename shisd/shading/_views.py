@@ -1,12 +1,12 @@
 """Smooth interpolation over view directions: splines in elevation, Fourier series in azimuth.
 
 A quantity f(theta, phi) that is smooth on the hemisphere of views has Fourier components f_k(theta) in azimuth with the
-parity f_k(-theta) = (-1)^k f_k(theta), and f_k(theta) / sin(theta) is smooth for k > 0. Splines of these quotients, with
-that parity built in, times sin(theta) cos(k phi) and sin(theta) sin(k phi), have a value and a gradient at theta = 0 that
-do not depend on the azimuth chosen there. So a view along the normal is an ordinary view.
+parity f_k(-theta) = (-1)^k f_k(theta), and f_k(theta) / sin(theta) is smooth for k > 0. Splines of these quotients,
+with that parity built in, times sin(theta) cos(k phi) and sin(theta) sin(k phi), have a value and a gradient at theta
+= 0 that do not depend on the azimuth chosen there. So a view along the normal is an ordinary view.
 
-notation: elevation nodes theta_j = (j + 1/2) h, j = 0 ... V-1, h = (pi/2) / V; cubic B-splines B(theta/h - 1/2 - j) with
-j = -2 ... V+1, so that every theta in [0, pi/2] sees four of them.
+notation: elevation nodes theta_j = (j + 1/2) h, j = 0 ... V-1, h = (pi/2) / V; cubic B-splines B(theta/h - 1/2 - j)
+with j = -2 ... V+1, so that every theta in [0, pi/2] sees four of them.
 """
 
 import functools
@@ -68,9 +68,8 @@ def azimuth_factors(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array,
     safe = jnp.where(off, sine, 1)
     cos, sin = angle_multiples(jnp.where(off, x / safe, 1), y / safe, max(count - 1, 1))
     x, y = x[None], y[None]
-    first = jnp.ones_like(x), jnp.zeros_like(x)
-    rest = (x * cos - y * sin, x * sin + y * cos)  # (x, y) = sin(theta) (cos, sin)(phi)
-    return tuple(jnp.concatenate([f, r])[:count] for f, r in zip(first, rest, strict=True))
+    real = jnp.concatenate([jnp.ones_like(x), x * cos - y * sin])  # (x, y) = sin(theta) (cos, sin)(phi)
+    return real[:count], jnp.concatenate([jnp.zeros_like(x), x * sin + y * cos])[:count]
 
 
 def _sine(view: Float[Array, "p 3"]) -> Float[Array, " p"]:

@@ -1,1 +1,1 @@
-"""Speed beside error: every method gets the same inputs, in turn, in one process. Not run by default; see `make bench`."""
+"""Speed beside error: every method gets the same inputs, in turn, in one process. See `make bench`."""

@@ -54,7 +54,9 @@ def literal(lobes, light):
 def tables(lobes, light, height):
     degree = lobes.degree
     scale = np.sqrt(4 * np.pi / (2 * np.arange(degree + 1) + 1))
-    split = light[:, None, :] * jnp.asarray((BANDS(degree) == np.arange(degree + 1)[:, None]) * scale[:, None], light.dtype)
+    split = light[:, None, :] * jnp.asarray(
+        (BANDS(degree) == np.arange(degree + 1)[:, None]) * scale[:, None], light.dtype
+    )
     maps = harmonics.synthesize_map(split.reshape(-1, split.shape[-1]), height, 2 * height)  # [H, 2H, 3 * (L+1)]
     maps = jnp.concatenate([jnp.roll(maps[:1], height, 1), maps, jnp.roll(maps[-1:], height, 1)])  # across the poles
     maps = jnp.concatenate([maps, maps[:, :1]], axis=1)
@@ -66,7 +68,9 @@ def tables(lobes, light, height):
         azimuth = (jnp.arctan2(d[:, 1], d[:, 0]) * height / np.pi - 0.5) % (2 * height)
         j, i = jnp.clip(polar.astype(int), 0, height), jnp.clip(azimuth.astype(int), 0, 2 * height - 1)
         u, v = (polar - j)[:, None], (azimuth - i)[:, None]
-        value = (1 - u) * ((1 - v) * maps[j, i] + v * maps[j, i + 1]) + u * ((1 - v) * maps[j + 1, i] + v * maps[j + 1, i + 1])
+        value = (1 - u) * ((1 - v) * maps[j, i] + v * maps[j, i + 1]) + u * (
+            (1 - v) * maps[j + 1, i] + v * maps[j + 1, i + 1]
+        )
         weights = interpolated_weights(lobes.weights, theta)
         return jnp.einsum("kcl,lk->c", value.reshape(-1, 3, degree + 1), weights)
 
@@ -86,7 +90,7 @@ def methods(lobes, light):
 
 
 def exact_slices(brdf, light, normals, views):
-    """Every pixel's own slice projected by quadrature and turned to the world, in float64: no table, no interpolation."""
+    """Every pixel's own slice projected by quadrature and turned to the world, in float64: no table."""
     degree = int(np.sqrt(light.shape[-1])) - 1
     with jax.enable_x64(True):
 

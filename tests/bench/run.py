@@ -1,8 +1,9 @@
 """Measure speed beside error and write the tables: python -m tests.bench.run [--output DIR] [--readme] [--only NAME].
 
 Results go to DIR/bench.json and DIR/bench.md; --readme also puts the tables between the README's bench markers.
-Allocator: outputs of tens of megabytes page-fault on every call with glibc's defaults, for every method alike; `make bench`
-sets MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000. XLA flags: default.
+Allocator: outputs of tens of megabytes page-fault on every call with glibc's defaults, for every method alike; `make
+bench` sets MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000. XLA
+flags: default.
 """
 
 import argparse
@@ -45,7 +46,11 @@ def competitor(degree):
         import sphericart.jax as sj
 
         values = jax.jit(lambda d: sj.spherical_harmonics(d, degree))
-        return "sphericart-jax", values, jax.jit(jax.value_and_grad(lambda d, w: jnp.vdot(sj.spherical_harmonics(d, degree), w)))
+        return (
+            "sphericart-jax",
+            values,
+            jax.jit(jax.value_and_grad(lambda d, w: jnp.vdot(sj.spherical_harmonics(d, degree), w))),
+        )
     except ImportError:
         import sphericart
 
@@ -94,7 +99,11 @@ def bench_evaluate(degrees=(16, 32, 64)):
     for degree in degrees:
         c = rng.normal(size=(degree + 1) ** 2).astype(np.float32)
         peer, values, _ = competitor(degree)
-        product = jax.jit(lambda d, values=values, c=c: values(d) @ c) if peer == "sphericart-jax" else lambda d, values=values, c=c: values(d) @ c
+        product = (
+            jax.jit(lambda d, values=values, c=c: values(d) @ c)
+            if peer == "sphericart-jax"
+            else lambda d, values=values, c=c: values(d) @ c
+        )
         ours = jax.jit(lambda d, c=c: harmonics.evaluate(c, d))
         times = interleaved({"ours": ours, "peer": product}, jnp.asarray(d))
         truth = host_basis(d[:500].astype(float), degree) @ c.astype(float)
@@ -134,7 +143,7 @@ def bench_project_map(degrees=(16, 64, 128)):
 
 
 def bench_equation_22(degrees=(4, 8, 16, 30)):
-    """Eq. 22 for 128 x 128 pixels (degree 30: 64 x 32), RGB, isotropic GGX of alpha 0.3, float32; errors against exact slices."""
+    """Eq. 22 at 128 x 128 pixels (degree 30: 64 x 32), RGB, GGX of alpha 0.3, float32; errors against exact slices."""
     rng = np.random.default_rng(0)
     normals = unit(rng.normal(size=(PIXELS, 3)))
     views = unit(rng.normal(size=(PIXELS, 3)))
@@ -163,7 +172,11 @@ def bench_equation_22(degrees=(4, 8, 16, 30)):
                 "max error / max": float(np.max(np.abs(error)) / np.max(np.abs(truth))),
                 "first call s": times[name].first,
             })  # fmt: skip
-        gradient = jax.jit(jax.grad(lambda n, v, lobes=lobes, light=light: jnp.sum(shading.shade_environment(lobes, light, n, v)), (0, 1)))
+        gradient = jax.jit(
+            jax.grad(
+                lambda n, v, lobes=lobes, light=light: jnp.sum(shading.shade_environment(lobes, light, n, v)), (0, 1)
+            )
+        )
         forward = candidates["rotated"]
         times = interleaved({"gradient": gradient, "forward": forward}, normals[:count], views[:count])
         rows[-1]["value and gradient / forward"] = times["gradient"].median / times["forward"].median
@@ -201,7 +214,15 @@ BENCHES = {
 def table(rows):
     """A Markdown table; columns that only some rows have are left empty in the others."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    show = lambda x: "" if x is None else f"{x:.2g}" if isinstance(x, float) and not 0.1 <= abs(x) < 1000 else f"{x:.2f}" if isinstance(x, float) else str(x)
+    show = lambda x: (
+        ""
+        if x is None
+        else f"{x:.2g}"
+        if isinstance(x, float) and not 0.1 <= abs(x) < 1000
+        else f"{x:.2f}"
+        if isinstance(x, float)
+        else str(x)
+    )
     lines = [columns, ["---"] * len(columns), *([show(row.get(c)) for c in columns] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
@@ -222,7 +243,8 @@ def main():
         sections.append(f"{BENCHES[name].__doc__}\n\n{table(results[name])}")
         print(sections[-1], "\n", flush=True)
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
-    note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {'tuned' if tuned else 'default'} allocator."
+    allocator = "tuned" if tuned else "default"
+    note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
     text = "\n\n".join([*sections, note])
     (arguments.output / "bench.json").write_text(json.dumps(results, indent=1))
     (arguments.output / "bench.md").write_text(text + "\n")

@@ -63,7 +63,10 @@ def test_derivatives(turn, x64, rng):
 
 
 def test_batches(rng):
-    c, r = rng.normal(size=(3, 16)).astype(np.float32), Rotation.random(4, random_state=1).as_matrix().astype(np.float32)
+    c, r = (
+        rng.normal(size=(3, 16)).astype(np.float32),
+        Rotation.random(4, random_state=1).as_matrix().astype(np.float32),
+    )
     batched = jax.vmap(harmonics.rotate, (None, 0))(c, r)
     np.testing.assert_allclose(batched, np.stack([harmonics.rotate(c, q) for q in r]), atol=1e-6)
 

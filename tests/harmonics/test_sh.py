@@ -27,7 +27,9 @@ def scipy_basis(directions, degree):
 
 def hard_directions(dtype, rng):
     """Random directions, both poles, and points at many distances from the poles and the equator."""
-    near = [[s * 10.0**-k, t * 10.0**-k, z] for k in (1, 3, 5, 7, 20) for s, t, z in ((1, 0, 1), (-1, 2, -1), (0, -1, 1))]
+    near = [
+        [s * 10.0**-k, t * 10.0**-k, z] for k in (1, 3, 5, 7, 20) for s, t, z in ((1, 0, 1), (-1, 2, -1), (0, -1, 1))
+    ]
     equator = [[1, 0, 0], [0, -1, 0], [1, 1, 1e-6], [-1, 1, -1e-9]]
     poles = [[0, 0, 1], [0, 0, -1]]
     return unit(np.concatenate([rng.normal(size=(300, 3)), near, equator, poles])).astype(dtype)
@@ -56,7 +58,7 @@ def test_basis_against_scipy(degree, dtype, rng):
 
 
 def test_basis_in_forty_digits(x64):
-    """A few values up to degree 100 by the textbook recurrence in 40 digits, with factorials, which SciPy has no part in."""
+    """A few values up to degree 100 by the textbook recurrence, with factorials: SciPy has no part in them."""
     mpmath.mp.dps = 60
     d = unit(np.array([[0.3, -0.2, 0.5], [1e-3, 2e-3, -1.0], [0.8, 0.6, 0.01]]))
     got = np.asarray(harmonics.sh_basis(d, 100))
@@ -83,7 +85,9 @@ def test_degree_200(x64, rng):
 def test_length_does_not_matter_and_zero_is_not_a_number(dtype):
     d = np.array([0.3, -0.2, 0.5], dtype)
     for scale in (1e-30, 1e-3, 1e3, 1e30):
-        np.testing.assert_allclose(harmonics.sh_basis((d * dtype.type(scale)), 4), harmonics.sh_basis(d, 4), rtol=0, atol=2e-6)
+        np.testing.assert_allclose(
+            harmonics.sh_basis((d * dtype.type(scale)), 4), harmonics.sh_basis(d, 4), rtol=0, atol=2e-6
+        )
     assert np.all(np.isnan(harmonics.sh_basis(np.zeros(3, dtype), 2)))
 
 
@@ -175,7 +179,11 @@ def test_transformations_agree(dtype, rng):
 
 def test_errors_name_the_argument(as_user):
     d = np.ones((2, 3), np.float32)
-    for degree, message in [(-1, "`degree` must be >= 0; got -1"), (2.5, "`degree` must be a Python integer"), (True, "got True")]:
+    for degree, message in [
+        (-1, "`degree` must be >= 0; got -1"),
+        (2.5, "`degree` must be a Python integer"),
+        (True, "got True"),
+    ]:
         with pytest.raises(ValueError, match=message):
             harmonics.sh_basis(d, degree)
     with pytest.raises(ValueError, match="`degree` must be a Python integer known while tracing"):

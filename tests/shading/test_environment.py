@@ -14,7 +14,7 @@ from shisd import decomposition, harmonics, models, shading
 
 DEGREE = 6
 COUNT = 1000
-DOUBLE = np.dtype("float64")
+SINGLE, DOUBLE = np.dtype("float32"), np.dtype("float64")
 
 
 def unit(x):
@@ -36,7 +36,7 @@ def tabulate(brdf, **options):
 
 
 @functools.cache
-def lobes_of(material, dtype=np.dtype("float32")):
+def lobes_of(material, dtype=SINGLE):
     """Tabulated once per precision; called with x64 switched as the dtype says."""
     return tabulate(MATERIALS[material]())
 
@@ -67,7 +67,9 @@ def equation_22(lobes, weights, light, rotation):
     total = 0.0
     for l in range(DEGREE + 1):
         band = slice(l * l, (l + 1) ** 2)
-        total = total + np.sqrt(4 * np.pi / (2 * l + 1)) * np.sum(weights[..., l, :] * (light[..., band] @ y[:, band].T), -1)
+        total = total + np.sqrt(4 * np.pi / (2 * l + 1)) * np.sum(
+            weights[..., l, :] * (light[..., band] @ y[:, band].T), -1
+        )
     return total
 
 
@@ -128,7 +130,9 @@ def test_band_limited_light_against_quadrature(x64, rng):
     theta, nodes, weights = (3 + 0.5) * np.pi / 32, *np.polynomial.legendre.leggauss(400)
     z, phi = (nodes + 1) / 2, (np.arange(800) + 0.5) * 2 * np.pi / 800
     sine = np.sqrt(1 - z**2)[:, None]
-    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.broadcast_to(z[:, None], (400, 800))], axis=-1).reshape(-1, 3)
+    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.broadcast_to(z[:, None], (400, 800))], axis=-1).reshape(
+        -1, 3
+    )
     area = np.repeat(weights / 2 * 2 * np.pi / 800, 800)
     wo = jnp.asarray([np.sin(theta), 0, np.cos(theta)])
     kernel = np.asarray(jax.vmap(lambda w: brdf.value_cosine(w, wo))(jnp.asarray(wi)))
@@ -175,7 +179,9 @@ def test_second_derivatives_in_the_geometry(x64, rng):
     check_grads(radiance, (normals, views), order=2, modes=["rev"], atol=1e-4, rtol=1e-4, eps=1e-5)
 
 
-@pytest.mark.parametrize("brdf", [models.Ggx, lambda alpha: models.CookTorrance(alpha, 0.3, [0.7, 0.5, 0.2])], ids=["ggx", "occt"])
+@pytest.mark.parametrize(
+    "brdf", [models.Ggx, lambda alpha: models.CookTorrance(alpha, 0.3, [0.7, 0.5, 0.2])], ids=["ggx", "occt"]
+)
 def test_derivative_in_the_material(brdf, x64, rng):
     light, normals, views, _ = (jnp.asarray(a) for a in scene(rng, 3, np.float64))
     radiance = lambda alpha: shading.shade_environment(tabulate(brdf(alpha), throw=False), light, normals, views)
