@@ -238,7 +238,7 @@ def check(rows: list[dict]) -> None:
             errors = [(r["degree"], r[f"{shape} error"]) for r in series]
             noise = series[0][f"{shape} noise"]
             for (d0, e0), (d1, e1) in zip(errors, errors[1:], strict=False):
-                assert e1 < max(e0, noise / 3), f"{material}, {light}, {shape}: degree {d0} {e0:.2g}, {d1} {e1:.2g}"
+                assert e1 < max(e0, 0.7 * noise), f"{material}, {light}, {shape}: degree {d0} {e0:.2g}, {d1} {e1:.2g}"
 
 
 def main(arguments: list[str] | None = None) -> None:
