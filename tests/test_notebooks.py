@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import matplotlib
 import pytest
 
@@ -24,7 +25,8 @@ def test_notebook_runs(path, monkeypatch, as_user):
     variables = {"__name__": "__main__"}
     try:
         for number, cell in enumerate(cells(path), 1):
-            exec(compile("".join(cell["source"]), f"{path.name}, code cell {number}", "exec"), variables)
+            with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # as readers have them
+                exec(compile("".join(cell["source"]), f"{path.name}, code cell {number}", "exec"), variables)
             for figure in map(pyplot.figure, pyplot.get_fignums()):
                 figure.canvas.draw()  # mistakes in text and layout appear only here
             pyplot.close("all")

@@ -14,6 +14,7 @@ from shisd import decomposition, harmonics, models, shading
 
 DEGREE = 6
 COUNT = 1000
+SLOW = pytest.mark.slow  # the same check on more cases; each compiles for many seconds
 SINGLE, DOUBLE = np.dtype("float32"), np.dtype("float64")
 
 
@@ -159,7 +160,9 @@ def test_views_between_the_nodes_are_interpolated_well(x64):
     assert np.max(error) < 1e-3  # beyond the last node, half a degree above the horizon
 
 
-@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize(
+    "material", ["glossy", pytest.param("diffuse", marks=SLOW), pytest.param("brushed", marks=SLOW)]
+)
 def test_derivatives_in_every_argument(material, x64, rng):
     lobes = lobes_of(material, DOUBLE)
     light, normals, views, tangents = (jnp.asarray(a) for a in scene(rng, 3, np.float64))
@@ -172,6 +175,7 @@ def test_derivatives_in_every_argument(material, x64, rng):
     check_grads(radiance, arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
 
 
+@pytest.mark.slow
 def test_second_derivatives_in_the_geometry(x64, rng):
     lobes = lobes_of("glossy", DOUBLE)
     light, normals, views, _ = (jnp.asarray(a) for a in scene(rng, 2, np.float64))
@@ -179,9 +183,10 @@ def test_second_derivatives_in_the_geometry(x64, rng):
     check_grads(radiance, (normals, views), order=2, modes=["rev"], atol=1e-4, rtol=1e-4, eps=1e-5)
 
 
-@pytest.mark.parametrize(
-    "brdf", [models.Ggx, lambda alpha: models.CookTorrance(alpha, 0.3, [0.7, 0.5, 0.2])], ids=["ggx", "occt"]
-)
+OCCT = lambda roughness: models.CookTorrance(roughness, 0.3, [0.7, 0.5, 0.2])
+
+
+@pytest.mark.parametrize("brdf", [pytest.param(models.Ggx, id="ggx"), pytest.param(OCCT, id="occt", marks=SLOW)])
 def test_derivative_in_the_material(brdf, x64, rng):
     light, normals, views, _ = (jnp.asarray(a) for a in scene(rng, 3, np.float64))
     radiance = lambda alpha: shading.shade_environment(tabulate(brdf(alpha), throw=False), light, normals, views)
@@ -191,8 +196,8 @@ def test_derivative_in_the_material(brdf, x64, rng):
 AXES = {"+z": [0.0, 0, 1], "-z": [0.0, 0, -1], "+x": [1.0, 0, 0]}
 
 
-@pytest.mark.parametrize("axis", AXES)
-@pytest.mark.parametrize("material", ["glossy", "brushed"])
+@pytest.mark.parametrize("axis", ["+z", pytest.param("-z", marks=SLOW), pytest.param("+x", marks=SLOW)])
+@pytest.mark.parametrize("material", ["glossy", pytest.param("brushed", marks=SLOW)])
 def test_special_geometry_is_ordinary(axis, material, x64, rng):
     """A normal along an axis of the world, seen along the normal: value and gradient are the limits from nearby."""
     lobes = lobes_of(material, DOUBLE)
