@@ -5,10 +5,6 @@ PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
 
-# XLA's CPU thread pool can lose a wake-up and wait for ever (seen with jaxlib 0.10.2 under load), so what must not
-# hang runs each program on one thread.
-STEADY := XLA_FLAGS="$(XLA_FLAGS) --xla_cpu_multi_thread_eigen=false"
-
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-slow lint bench clean
@@ -22,13 +18,13 @@ help:
 	@echo "make clean      remove .venv and output"
 
 demo: $(VENV)/.demo
-	$(STEADY) $(RUN) examples/relight.py --output output/relight --overwrite
+	$(RUN) examples/relight.py --output output/relight --overwrite
 
 test: $(VENV)/.test
-	$(STEADY) $(RUN) -m pytest -n 2 --dist loadfile -m "not slow"
+	$(RUN) -m pytest -n 2 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.test
-	$(STEADY) $(RUN) -m pytest -n 2 --dist loadfile -m slow
+	$(RUN) -m pytest -n 2 --dist loadfile -m slow
 
 lint: $(VENV)/.test
 	$(RUN) -m ruff check .

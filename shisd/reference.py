@@ -223,8 +223,7 @@ def _ggx_density(wi: Array, wo: Array, alpha: Array) -> Array:
 def _monte_carlo(
     brdf: AbstractBrdf, environment: Environment, frames: Array, views: Array, key: Array, count: int
 ) -> Estimate:
-    """At least `count` pairs of samples that follow the cosine, `count` of half vectors, and six times that of the map.
-    """
+    """At least `count` pairs of samples that follow the cosine, `count` of half vectors, six times that of the map."""
     light = _map_density(environment)
     alpha = jnp.clip(jnp.asarray(brdf.lobe_width, views.dtype), 0.01, 1.0)
     grids = [_strata(n) for n in (6 * count, count, count)]

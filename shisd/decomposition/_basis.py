@@ -119,7 +119,7 @@ class RotatedZonalBasis(eqx.Module):
         This bounds how much relative errors of coefficients grow in weights. It is 1 for band 0, and of the order of
         1/eps, or infinite, for a band that the axes do not resolve.
         """
-        s = jnp.linalg.svd(self._matrices(), compute_uv=False)  # [L+1, 2L+1], falling
+        s = jax.lax.map(lambda a: jnp.linalg.svd(a, compute_uv=False), self._matrices())  # [L+1, 2L+1], falling
         bands = np.arange(self.degree + 1)
         return s[:, 0] / s[bands, 2 * bands]
 
@@ -160,15 +160,19 @@ def _minimum_norm(
     slower, but their gradients in float32 are 10 to 1000 times less exact at condition numbers 40 to 400.
     """
     own_rows = np.where(mask[:, None, :], 0, np.eye(mask.shape[1]))
-    q, r = jnp.linalg.qr(jnp.concatenate([jnp.swapaxes(m, -1, -2), jnp.asarray(own_rows, dtype=m.dtype)], axis=1))
+    padded = jnp.concatenate([jnp.swapaxes(m, -1, -2), jnp.asarray(own_rows, dtype=m.dtype)], axis=1)
+    # One band after another: jaxlib's batched LAPACK calls wait for threads of the pool from inside the pool, and two
+    # at once on two cores wait for ever (seen with jaxlib 0.10.2).
+    q, r = jax.lax.map(lambda a: tuple(jnp.linalg.qr(a)), padded)
 
     # With n = 2l+1 rows, cond_F / n <= cond_2 <= cond_F: no singular values are needed.
-    r_inverse = solve_triangular(r, jnp.broadcast_to(jnp.eye(r.shape[-1], dtype=r.dtype), r.shape))
+    r_inverse = jax.lax.map(lambda a: solve_triangular(a, jnp.eye(r.shape[-1], dtype=r.dtype)), r)
     norm = lambda a: jnp.sqrt(jnp.sum(jnp.where(mask[:, None, :] & mask[:, :, None], a * a, 0), axis=(1, 2)))
     condition = norm(r) * norm(r_inverse) / jnp.asarray(mask.sum(axis=1), dtype=r.dtype)
     bad = ~(jax.lax.stop_gradient(condition) <= float(jnp.finfo(r.dtype).eps) ** -0.5)
     c = eqx.branched_error_if(c, jnp.any(bad), jnp.argmax(bad), [_unresolved(l) for l in range(len(mask))])
-    return jnp.matmul(q[:, : m.shape[-1]], solve_triangular(r, c, trans="T"), precision="highest")
+    solution = jax.lax.map(lambda a: solve_triangular(*a, trans="T"), (r, c))
+    return jnp.matmul(q[:, : m.shape[-1]], solution, precision="highest")
 
 
 def _unresolved(l: int) -> str:
