@@ -7,7 +7,7 @@ The paper inverts a square M_l per band and shares axes by taking the first 2l+1
 let all K >= 2L+1 axes serve every band and take the weights of least norm, lambda_l = M_l^+ c_l: lower bands are then
 better conditioned, and the integrals that use the weights need every axis in every band anyway. Both are one
 computation: QR of M_l^T, whose error grows with cond(M_l) (normal equations: its square), the columns that a band does
-not use set to zero in M_l. All bands are padded to 2L+1 rows and stacked: a call is a few batched operations.
+not use set to zero in M_l. All bands are padded to 2L+1 rows and stacked, so that one loop serves them.
 """
 
 import functools
@@ -155,9 +155,8 @@ def _minimum_norm(
     """x of least norm with m x = c in every band, for right-hand sides that are zero outside `mask` [bands, n].
 
     notation: m^T = q r, x = q r^-T c. Padding columns of m^T get a row of their own with a one in it: that keeps full
-    rank, as derivatives of QR need, and leaves the columns in use alone. Measured at degree 30, against bands one by
-    one: 2 times slower, but as fast with gradient and 20 times faster to compile. Against normal equations: 2 times
-    slower, but their gradients in float32 are 10 to 1000 times less exact at condition numbers 40 to 400.
+    rank, as derivatives of QR need, and leaves the columns in use alone. Normal equations would be
+    faster, but their gradients in float32 are 10 to 1000 times less exact at condition numbers 40 to 400.
     """
     own_rows = np.where(mask[:, None, :], 0, np.eye(mask.shape[1]))
     padded = jnp.concatenate([jnp.swapaxes(m, -1, -2), jnp.asarray(own_rows, dtype=m.dtype)], axis=1)

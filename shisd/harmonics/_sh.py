@@ -33,7 +33,7 @@ def sh_basis(directions: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
     `degree` L >= 0. Returns [..., (L+1)^2] in the dtype of `directions`, index l*(l+1)+m.
     Derivatives: in `directions`, every order, both modes, exact at the poles.
     Accuracy: 1e-13 at degree 30 and 1e-12 at degree 100 in float64; 3e-6 at degree 16 and 3e-5 at degree 100 in
-    float32. Cost: a matrix product with L+1 columns per two coefficients; the result is (L+1)^2 numbers per direction,
+    float32. Cost: a matrix product of 2(L+1) terms per coefficient; the result is (L+1)^2 numbers per direction,
     so to evaluate an expansion use `evaluate`.
     Source: ISD15 Eq. 7, ISD15s Eq. 3-5.
     """

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from scipy.special import sph_harm_y
 
 from shisd import decomposition, harmonics, models, shading
+from tests.harmonics.test_sh import scipy_basis
 
 DEGREE = 6
 COUNT = 1000
@@ -42,18 +42,6 @@ def lobes_of(material, dtype=SINGLE):
     return tabulate(MATERIALS[material]())
 
 
-def real_sh(directions, degree):
-    """SciPy's harmonics in our convention."""
-    theta = np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), directions[..., 2])
-    phi = np.arctan2(directions[..., 1], directions[..., 0])
-    columns = []
-    for l in range(degree + 1):
-        for m in range(-l, l + 1):
-            y = sph_harm_y(l, abs(m), theta, phi)
-            columns.append(y.real if m == 0 else np.sqrt(2) * (y.real if m > 0 else y.imag))
-    return np.stack(columns, axis=-1)
-
-
 def any_frame(normal):
     """Columns t, b, n: a frame of another make than the library's."""
     helper = np.eye(3)[np.argmin(np.abs(normal))]
@@ -64,7 +52,7 @@ def any_frame(normal):
 def equation_22(lobes, weights, light, rotation):
     """sum over l, k of pi_l lambda_l^k sum over m of e_l^m y_l^m(R z_k), with SciPy's harmonics, in float64."""
     axes = np.asarray(lobes.basis.directions, float) @ rotation.T
-    y = real_sh(axes, DEGREE)
+    y = scipy_basis(axes, DEGREE)
     total = 0.0
     for l in range(DEGREE + 1):
         band = slice(l * l, (l + 1) ** 2)
@@ -139,7 +127,7 @@ def test_band_limited_light_against_quadrature(x64, rng):
     kernel = np.asarray(jax.vmap(lambda w: brdf.value_cosine(w, wo))(jnp.asarray(wi)))
     for normal in normals:
         frame = any_frame(normal)
-        radiance = real_sh(wi @ frame.T, DEGREE) @ light.T
+        radiance = scipy_basis(wi @ frame.T, DEGREE) @ light.T
         expected = np.sum(kernel * radiance * area[:, None], axis=0)
         got = shading.shade_environment(lobes, light, normal, frame @ np.asarray(wo))
         np.testing.assert_allclose(got, expected, atol=2e-6 * np.max(np.abs(expected)))
