@@ -112,10 +112,12 @@ def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]
 def _basis_jvp(degree, primals, tangents):
     (u,), (du,) = primals, tangents
     y = _basis(u, degree)
+    # The product with ones is a broadcast whose transpose, the sum over coefficients, is a matrix product and not a loop.
+    ones = jnp.ones((3, 1, y.shape[-1]), y.dtype)
     dy = jnp.zeros_like(y)
     for axis, terms in enumerate(_tables.gradient_gather(degree, transpose=False)):
-        for index, factor in terms:
-            dy += jnp.einsum("...,j,...j->...j", du[..., axis], jnp.asarray(factor, u.dtype), y[..., index])
+        slope = sum(jnp.asarray(factor, y.dtype) * y[..., index] for index, factor in terms)
+        dy += (du[..., axis, None] @ ones[axis]) * slope
     return y, dy
 
 
