@@ -112,13 +112,14 @@ def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]
 def _basis_jvp(degree, primals, tangents):
     (u,), (du,) = primals, tangents
     y = _basis(u, degree)
-    # The product with ones is a broadcast whose transpose, the sum over coefficients, is a matrix product and not a loop.
-    ones = jnp.ones((3, 1, y.shape[-1]), y.dtype)
-    dy = jnp.zeros_like(y)
-    for axis, terms in enumerate(_tables.gradient_gather(degree, transpose=False)):
-        slope = sum(jnp.asarray(factor, y.dtype) * y[..., index] for index, factor in terms)
-        dy += (du[..., axis, None] @ ones[axis]) * slope
-    return y, dy
+    flat = y.reshape(-1, y.shape[-1])
+    ones = jnp.ones((1, y.shape[-1]), y.dtype)  # a broadcast as a product: its transpose, a sum, is slow as a loop
+    dy = jnp.zeros_like(flat)
+    for rate, terms in zip(du.reshape(-1, 3).T, _tables.gradient_gather(degree, transpose=False), strict=True):
+        slope = sum(jnp.asarray(factor[None], y.dtype) * flat[:, index] for index, factor in terms)
+        if terms:
+            dy += (rate[:, None] @ ones) * slope
+    return y, dy.reshape(y.shape)
 
 
 @functools.cache
