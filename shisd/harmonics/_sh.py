@@ -85,26 +85,23 @@ def _evaluate(c: Float[Array, "*c n"], directions: Float[Array, "*d 3"], degree:
     return values.transpose(pairs).reshape(np.broadcast_shapes(c.shape[:-1], u.shape[:-1]))
 
 
-def _waves(u: Float[Array, "points 3"], degree: int) -> tuple[Array, Array, Array, Array]:
-    """cos(k theta), sin(k theta), cos(m phi), sin(m phi), each [L+1, points]: points are the vector lanes.
-
-    phi = 0 at the poles, where every y_l^m with m != 0 vanishes.
-    """
+def _angles(u: Float[Array, "points 3"]) -> Float[Array, "4 points"]:
+    """cos(theta), sin(theta), cos(phi), sin(phi). phi = 0 at the poles, where every y_l^m with m != 0 vanishes."""
     x, y, z = u.T
     rho = jnp.sqrt(x * x + y * y)
     safe = jnp.where(rho > 0, rho, 1)
-    polar = angle_multiples(z, rho, degree + 1)
-    return *polar, *angle_multiples(jnp.where(rho > 0, x / safe, 1), y / safe, degree + 1)
+    return jnp.stack([z, rho, jnp.where(rho > 0, x / safe, 1), y / safe])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]:
     """The basis at unit vectors; off the sphere (in derivatives) the solid harmonics r^l y_l^m."""
     series, factors = (jnp.asarray(table, u.dtype) for table in _basis_tables(degree))
-    cos, sin, cos_m, sin_m = _waves(u.reshape(-1, 3), degree)
-    polar = jnp.concatenate([cos, sin]).T @ series
+    # [2 (L+1), points], points in the vector lanes: cosines, then sines.
+    theta, phi = (jnp.concatenate(angle_multiples(*a, degree + 1)) for a in jnp.split(_angles(u.reshape(-1, 3)), 2))
+    polar = theta.T @ series
     # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
-    azimuth = jnp.concatenate([cos_m, sin_m]).T @ factors
+    azimuth = phi.T @ factors
     return (polar * azimuth[:, _tables.orders(degree) + degree]).reshape(*u.shape[:-1], -1)
 
 
@@ -140,10 +137,15 @@ def _expand(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) ->
     even, odd = _fourier(c, degree)
 
     def at(u: Float[Array, "points 3"]) -> Float[Array, "f points"]:
-        cos, sin, cos_m, sin_m = _waves(u, degree)
+        z, rho, *phi = _angles(u)
+        cos_phi, sin_phi = (a[None] for a in phi)
+        cos, sin = angle_multiples(z, rho, degree + 1)
         e, o = (w.reshape(c.shape[0], 2, -1, u.shape[0]) for w in (even @ cos, odd @ sin))
-        waves = jnp.stack([cos_m, sin_m])[None]
-        return jnp.sum(e * waves[:, :, 0::2], axis=(1, 2)) + jnp.sum(o * waves[:, :, 1::2], axis=(1, 2))
+        x, y = jnp.zeros((2, c.shape[0], u.shape[0]), c.dtype)
+        for m in range(degree, -1, -1):  # Horner's rule for the real part of sum (e_m - i e_-m) exp(i m phi)
+            wave = (o if m % 2 else e)[:, :, m // 2]
+            x, y = x * cos_phi - y * sin_phi + wave[:, 0], x * sin_phi + y * cos_phi - wave[:, 1]
+        return x
 
     return _in_tiles(at, u, _POINTS_AT_ONCE)
 

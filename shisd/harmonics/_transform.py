@@ -48,8 +48,7 @@ def project_map(texels: ArrayLike, degree: int) -> Float[Array, "*colour n"]:
     largest = min(height - 1, (width - 1) // 2)
     if degree > largest:
         raise ValueError(f"`degree` {degree} is too high for {height} x {width} texels; pass {largest} or less.")
-    coefficients = analyse(texels.reshape(height, width, -1), "fejer", degree)
-    return coefficients.reshape(*texels.shape[2:], -1)
+    return analyse(texels, "fejer", degree)
 
 
 def project(
@@ -74,8 +73,7 @@ def project(
         raise ValueError(
             f"`function` must return [{directions.shape[0]}, *colour] for as many directions; got {list(values.shape)}."
         )
-    grid = values.reshape(rule_degree // 2 + 1, rule_degree + 1, -1)
-    return analyse(grid, "gauss", degree).reshape(*values.shape[1:], -1)
+    return analyse(values.reshape(rule_degree // 2 + 1, rule_degree + 1, *values.shape[1:]), "gauss", degree)
 
 
 def synthesize_map(coefficients: ArrayLike, height: int, width: int | None = None) -> Float[Array, "h w *colour"]:
@@ -88,11 +86,10 @@ def synthesize_map(coefficients: ArrayLike, height: int, width: int | None = Non
     c, _ = _checks.coefficients("coefficients", coefficients)
     height = _checks.integer("height", height, minimum=1)
     width = 2 * height if width is None else _checks.integer("width", width, minimum=1)
-    values = synthesize(c.reshape(-1, c.shape[-1]), "fejer", height, width)
-    return values.reshape(height, width, *c.shape[:-1])
+    return synthesize(c, "fejer", height, width)
 
 
-def analyse(values: Float[Array, "rows columns f"], rule: Rows, degree: int) -> Float[Array, "f n"]:
+def analyse(values: Float[Array, "rows columns *f"], rule: Rows, degree: int) -> Float[Array, "*f n"]:
     """Coefficients of functions on a grid: rows of the rule, columns at the azimuths 2 pi (i + 1/2) / columns."""
     rows, columns = values.shape[:2]
     tables = (
@@ -103,7 +100,7 @@ def analyse(values: Float[Array, "rows columns f"], rule: Rows, degree: int) -> 
     return _analyse(values, *tables, degree)
 
 
-def synthesize(c: Float[Array, "f n"], rule: Rows, rows: int, columns: int) -> Float[Array, "{rows} {columns} f"]:
+def synthesize(c: Float[Array, "*f n"], rule: Rows, rows: int, columns: int) -> Float[Array, "{rows} {columns} *f"]:
     """Values of expansions on a grid: the same rows and columns."""
     _, degree = _checks.coefficients("coefficients", c)
     tables = (
@@ -116,9 +113,9 @@ def synthesize(c: Float[Array, "f n"], rule: Rows, rows: int, columns: int) -> F
 
 # The tables are arguments of the compiled functions, not constants in them.
 @functools.partial(jax.jit, static_argnums=4)
-def _analyse(values: Array, azimuth: Array, polar: Array, series: Array, degree: int) -> Float[Array, "f n"]:
-    rows, half = values.shape[0], polar.shape[2]
-    values = jnp.moveaxis(values, -1, 0)
+def _analyse(values: Array, azimuth: Array, polar: Array, series: Array, degree: int) -> Float[Array, "*f n"]:
+    rows, half, functions = values.shape[0], polar.shape[2], values.shape[2:]
+    values = jnp.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
     if jnp.iscomplexobj(azimuth):
         bins = jnp.fft.rfft(values)[..., : azimuth.size]
         bins = jnp.pad(bins, ((0, 0), (0, 0), (0, azimuth.size - bins.shape[-1]))) * azimuth.reshape(1, 1, -1)
@@ -133,14 +130,15 @@ def _analyse(values: Array, azimuth: Array, polar: Array, series: Array, degree:
     paired = jnp.stack([jnp.stack([even[0], odd[1]]), jnp.stack([even[1], odd[0]])])  # l + m even: even in z
     waves = jnp.einsum("pqjk,pqfjhr->pqhkfr", polar, paired)
     blocks = jnp.einsum("pqhik,pqhkfr->fpqhir", series, waves)
-    return blocks.reshape(blocks.shape[0], -1)[:, _block_index(degree)]
+    return blocks.reshape(blocks.shape[0], -1)[:, _block_index(degree)].reshape(*functions, -1)
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5, 6))
 def _synthesize(
     c: Array, azimuth: Array, polar: Array, series: Array, degree: int, rows: int, columns: int
-) -> Float[Array, "rows columns f"]:
-    n = degree // 2 + 1
+) -> Float[Array, "rows columns *f"]:
+    n, functions = degree // 2 + 1, c.shape[:-1]
+    c = c.reshape(-1, c.shape[-1])
     source = np.full(8 * n**2, c.shape[-1])
     source[_block_index(degree)] = np.arange(c.shape[-1])
     blocks = jnp.pad(c, ((0, 0), (0, 1)))[:, source].reshape(-1, 2, 2, n, n, 2)
@@ -152,10 +150,11 @@ def _synthesize(
     orders = orders.reshape(-1, rows, 2 * n, 2)
     if not jnp.iscomplexobj(azimuth):
         values = orders.reshape(-1, 4 * n) @ azimuth.reshape(columns, -1).T
-        return jnp.moveaxis(values.reshape(-1, rows, columns), 0, -1)
+        return jnp.moveaxis(values.reshape(-1, rows, columns), 0, -1).reshape(rows, columns, *functions)
     halves = jnp.where(np.arange(2 * n) == 0, columns, columns / 2).astype(azimuth.dtype)
     bins = jax.lax.complex(orders[..., 0], -orders[..., 1]) * (halves * jnp.conj(azimuth)).reshape(1, 1, -1)
-    return jnp.moveaxis(jnp.fft.irfft(bins[..., : degree + 1], n=columns), 0, -1)
+    values = jnp.fft.irfft(bins[..., : degree + 1], n=columns)
+    return jnp.moveaxis(values, 0, -1).reshape(rows, columns, *functions)
 
 
 @functools.cache

@@ -21,7 +21,7 @@ from shisd._typing import Array, Float
 from shisd.harmonics._rotation import rotate_many
 from shisd.shading._lobes import Lobes, lookup_table, slice_values
 
-_TILE = 128  # pixels at a time: what one tile holds stays in the cache
+_NUMBERS_AT_ONCE = 1 << 19  # coefficients of turned light held at a time: what one tile of pixels needs stays in cache
 
 
 def shade_environment(
@@ -42,7 +42,8 @@ def shade_environment(
     Derivatives: in every floating argument, both modes, any order; smooth where a view lies along its normal and where
     a normal lies along any axis of the world. The cut at the horizon is a discontinuity of the view, with no gradient.
     Accuracy: Eq. 22 to 1e-5 in float32 and 1e-12 in float64, relative to the largest radiance.
-    Cost: about L^3 products per pixel. Memory: one tile of 128 pixels, and the result; the same with gradients.
+    Cost: about L^3 products per pixel. Memory: one tile of at most 2048 pixels, about 2 MB per array, and the
+    result; the same with gradients.
     Source: ISD15 Eq. 20-22.
     """
     if not isinstance(lobes, Lobes):
@@ -79,8 +80,11 @@ def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) 
     table = lookup_table(lobes, degree)
     colour = np.broadcast_shapes(lobes.colour, e.shape[:-1])
     count = frames[0].shape[0]
-    tiles = -(-count // _TILE)
-    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * _TILE - count, 3))]).reshape(tiles, _TILE, 3)
+    if count == 0:
+        return jnp.zeros((0, *colour), e.dtype)
+    size = min(count, 2048, 1 << max(1, _NUMBERS_AT_ONCE // e.size).bit_length() - 1)
+    tiles = -(-count // size)
+    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
 
     @jax.checkpoint
     def shade_tile(tile: tuple[Array, ...]) -> Float[Array, " p *colour"]:
@@ -89,15 +93,13 @@ def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) 
         light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(r, 1, 2), degree, lobes.isotropic)
         local = jnp.einsum("pij,pi->pj", r, view)
         slices = slice_values(table, local, lobes)  # [*colour, n, p]
-        light = jnp.moveaxis(light.reshape(light.shape[0], *e.shape[:-1], _TILE), 0, -2)
+        light = jnp.moveaxis(light.reshape(light.shape[0], *e.shape[:-1], size), 0, -2)
         shape = (*colour, *light.shape[-2:])
         radiance = jnp.sum(jnp.broadcast_to(slices, shape) * jnp.broadcast_to(light, shape), axis=-2)
         return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(radiance, -1, 0))
 
-    if count == 0:
-        return jnp.zeros((0, *colour), e.dtype)
     radiance = jax.lax.map(shade_tile, tuple(fill(a) for a in frames))
-    return radiance.reshape(tiles * _TILE, *radiance.shape[2:])[:count]
+    return radiance.reshape(tiles * size, *radiance.shape[2:])[:count]
 
 
 @jax.custom_jvp

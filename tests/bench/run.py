@@ -9,7 +9,6 @@ flags: default.
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +21,7 @@ from shisd import decomposition, harmonics, models, shading
 from shisd.harmonics import _tables
 from tests.bench import equation_22
 from tests.bench.timing import interleaved
+from tests.truth import scipy_basis
 
 POINTS = 10_000
 PIXELS = 128 * 128
@@ -29,15 +29,6 @@ PIXELS = 128 * 128
 
 def unit(x):
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
-
-
-def host_basis(directions, degree):
-    """y_l^m in float64 by the recurrence on the host, as truth for float32."""
-    theta = np.arctan2(np.hypot(directions[:, 0], directions[:, 1]), directions[:, 2])
-    phi = np.arctan2(directions[:, 1], directions[:, 0])
-    p, m, l = _tables.associated_legendre(theta, degree), _tables.orders(degree), _tables.bands(degree)
-    angle = np.where(m >= 0, np.cos(np.outer(phi, m)), np.sin(np.outer(phi, -m))) * np.where(m == 0, 1, np.sqrt(2))
-    return p[l, np.abs(m)].T * angle
 
 
 def competitor(degree):
@@ -70,7 +61,7 @@ def bench_basis(degrees=(4, 8, 16, 32, 64, 100)):
     for degree in degrees:
         peer, values, gradients = competitor(degree)
         basis = jax.jit(lambda d, degree=degree: harmonics.sh_basis(d, degree))
-        truth = host_basis(d[:500].astype(float), degree)
+        truth = scipy_basis(d[:500].astype(float), degree)
         signs = np.where(_tables.orders(degree) % 2, -1, 1)  # sphericart: no Condon-Shortley phase
         times = interleaved({"ours": basis, "peer": values}, jnp.asarray(d))
         row = {
@@ -106,7 +97,7 @@ def bench_evaluate(degrees=(16, 32, 64)):
         )
         ours = jax.jit(lambda d, c=c: harmonics.evaluate(c, d))
         times = interleaved({"ours": ours, "peer": product}, jnp.asarray(d))
-        truth = host_basis(d[:500].astype(float), degree) @ c.astype(float)
+        truth = scipy_basis(d[:500].astype(float), degree) @ c.astype(float)
         rows.append({
             "degree": degree,
             "us/point": times["ours"].median / POINTS * 1e6,
@@ -192,7 +183,8 @@ def bench_memory(degree=30):
 
 def memory_child(degree):
     rng = np.random.default_rng(0)
-    peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    status = Path("/proc/self/status")  # not getrusage: its peak starts from that of the parent process
+    peak = lambda: int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**20
     normals = unit(rng.normal(size=(1024 * 768, 3))).astype(np.float32)
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
     lobes = shading.tabulate_brdf(models.Ggx(0.3), basis)

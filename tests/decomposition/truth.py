@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.harmonics.test_sh import scipy_basis as sh
+from tests.truth import scipy_basis as sh
 
 
 def matrices(z, degree):

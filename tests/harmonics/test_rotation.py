@@ -8,7 +8,8 @@ from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
 from shisd import harmonics
-from tests.harmonics.test_sh import scipy_basis, unit
+from tests.harmonics.test_sh import unit
+from tests.truth import scipy_basis
 
 TURNS = {
     "none": [0, 0, 0],

@@ -6,23 +6,13 @@ import mpmath
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from scipy.special import sph_harm_y
 
 from shisd import harmonics
+from tests.truth import scipy_basis
 
 
 def unit(x):
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
-
-
-def scipy_basis(directions, degree):
-    """SciPy's complex harmonics, whose phase is Condon-Shortley's, as real ones: ISD15 Eq. 7."""
-    d = np.asarray(directions, float)
-    theta, phi = np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]), np.arctan2(d[..., 1], d[..., 0])
-    l = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
-    m = np.concatenate([np.arange(-k, k + 1) for k in range(degree + 1)])
-    y = sph_harm_y(l, np.abs(m), theta[..., None], phi[..., None])
-    return np.where(m == 0, y.real, np.sqrt(2) * np.where(m > 0, y.real, y.imag))
 
 
 def hard_directions(dtype, rng):
