@@ -98,7 +98,10 @@ def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]
     """The basis at unit vectors; off the sphere (in derivatives) the solid harmonics r^l y_l^m."""
     series, factors = (jnp.asarray(table, u.dtype) for table in _basis_tables(degree))
     # [2 (L+1), points], points in the vector lanes: cosines, then sines.
-    theta, phi = (jnp.concatenate(angle_multiples(*a, degree + 1)) for a in jnp.split(_angles(u.reshape(-1, 3)), 2))
+    theta, phi = (
+        jnp.concatenate(angle_multiples(cos, sin, degree + 1))
+        for cos, sin in _angles(u.reshape(-1, 3)).reshape(2, 2, -1)
+    )
     polar = theta.T @ series
     # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
     azimuth = phi.T @ factors
