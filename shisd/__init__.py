@@ -1,6 +1,7 @@
 """Spherical kernels as weighted sums of rotated zonal harmonics, differentiable from material and light to radiance."""
 
 from shisd import decomposition as decomposition
+from shisd import domains as domains
 from shisd import harmonics as harmonics
 from shisd import models as models
 from shisd import shading as shading

@@ -194,12 +194,59 @@ def memory_child(degree):
     print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
 
 
+def bench_polygons(degrees=(8, 20)):
+    """Integrals of 2L+1 weighted lobes over 16,384 quads of 0.5 rad, float32, against C++ on one thread (AVX2)."""
+    from shisd.domains import _moments
+    from tests.bench import native, polygons
+
+    rng = np.random.default_rng(0)
+    z, x = unit(rng.normal(size=(2, PIXELS, 1, 3)))
+    x = unit(np.cross(x, z))
+    angle = (np.arange(4) + rng.uniform(-0.3, 0.3, (PIXELS, 4)))[..., None] * (np.pi / 2)
+    quads = np.cos(0.5) * z + np.sin(0.5) * (np.cos(angle) * x + np.sin(angle) * np.cross(z, x))
+    quads = quads.astype(np.float32)
+    tiles = jnp.asarray(quads.reshape(-1, 128, 4, 3).transpose(0, 3, 2, 1))
+    rows = []
+    for degree in degrees:
+        axes = unit(rng.normal(size=(2 * degree + 1, 3))).astype(np.float32)
+        w = rng.normal(size=(degree + 1, len(axes))).astype(np.float32)
+        w[0] = 0
+        fold = lambda v, axes=axes, w=w, degree=degree: jax.lax.map(
+            lambda tile: _moments.fold(jnp.asarray(w)[..., None], jnp.asarray(axes), tile, degree), v
+        ).reshape(-1)
+        ours = jax.jit(fold)
+        gradient = jax.jit(jax.value_and_grad(lambda v, fold=fold: jnp.sum(fold(v))))
+        times = interleaved(
+            {
+                "ours": ours,
+                "gradient": gradient,
+                "plain": lambda v, axes=axes, w=w: native.polygon_moments(quads, axes, w),
+                "same": lambda v, axes=axes, w=w: native.polygon_moments(quads, axes, w, difference=True),
+            },
+            tiles,
+        )
+        truth = np.einsum("pkl,lk->p", polygons.edge_quadrature(quads[:64].astype(float), axes, degree), w)
+        error = lambda got, truth=truth: float(np.max(np.abs(np.asarray(got)[:64] - truth)) / np.max(np.abs(truth)))
+        rows.append({
+            "degree": degree,
+            "us/quad": times["ours"].median / PIXELS * 1e6,
+            "speed / C++, same recurrence": times["same"].median / times["ours"].median,
+            "speed / C++, plain recurrence": times["plain"].median / times["ours"].median,
+            "value and gradient / forward": times["gradient"].median / times["ours"].median,
+            "max error / max": error(ours(tiles)),
+            "C++, plain: error": error(native.polygon_moments(quads, axes, w)),
+            "first call s": times["ours"].first,
+        })  # fmt: skip
+    return rows
+
+
 BENCHES = {
     "basis": bench_basis,
     "evaluate": bench_evaluate,
     "project_map": bench_project_map,
     "equation_22": bench_equation_22,
     "memory": bench_memory,
+    "polygons": bench_polygons,
 }
 
 

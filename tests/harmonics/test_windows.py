@@ -107,6 +107,7 @@ def test_no_window_helps_a_mean_below_the_floor(dtype):
     assert bool(nan.status == harmonics.WindowStatus.mean_below_floor)
 
 
+@pytest.mark.slow
 def test_derivatives_of_dering_are_those_of_the_implicit_function(x64, rng):
     c = spikes(3, np.float64)
     v = jnp.asarray(rng.normal(size=c.shape))

@@ -1,0 +1,172 @@
+"""Integrals over regions of the sphere: of zonal functions, of cosine powers, and of any expansion (CSH18 Eq. 1).
+
+An expansion is integrated through zonal functions about shared axes, which are all that `_moments` computes: with K
+axes z_k that resolve each band, I_l(z_k) = 4 pi/(2l+1) sum_m y_l^m(z_k) c_l^m determines the integrals c_l^m of the
+basis. The other route, without axes, writes the gradient of r^l y_l^m as harmonics of degree l-1 and integrates those
+along the edges by quadrature. It is smooth to every order, but needs (L/4) theta + 8 nodes on an edge with (L+1)^2
+harmonics each, and small polygons lose digits in it (tests/bench compares).
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+
+from shisd import _checks
+from shisd._numerics import normalize
+from shisd._typing import Array, Float
+from shisd.decomposition import fibonacci_directions, optimized_directions
+from shisd.domains import _moments
+from shisd.domains._moments import Loop
+from shisd.domains._polygon import SphericalPolygon, loop_solid_angle
+from shisd.domains._region import SphericalCap
+from shisd.harmonics import _tables, legendre, sh_basis
+
+Region = SphericalPolygon | SphericalCap
+_TABLE_DEGREE = 32  # where the table of optimised axes ends
+
+
+def zonal_moments(region: Region, axes: ArrayLike, degree: int) -> Float[Array, "k l"]:
+    """Integrals of P_l(w . axis) over a region, for every axis and l = 0 ... degree.
+
+    Arguments: a `SphericalPolygon` or `SphericalCap`; `axes` [K, 3], of any length but zero; static `degree` L.
+    Returns [K, L+1] in sr.
+    Derivatives: in vertices and axes, both modes, any order; the first exact where vertices coincide and where an axis
+    lies on a vertex or in the plane of an edge. Second derivatives at coincident vertices are finite but not the limit.
+    Accuracy: error over solid angle, at every degree up to 100 and every size from 1e-4 rad to a hemisphere: 1e-13 in
+    float64; in float32 2e-6 for axes at random, 3e-5 for axes within the polygon at degree 100, where a rounded axis is
+    that uncertain.
+    Cost: one sweep over the degrees, about 30 operations for every degree, axis and edge.
+    """
+    degree = _checks.degree(degree)
+    d = _checks.vectors("axes", axes)
+    if d.ndim != 2:
+        raise ValueError(f"`axes` must have shape [K, 3]; got {list(d.shape)}.")
+    _check_region(region)
+    return _zonal_moments(region, d, degree)
+
+
+def axial_moments(polygon: SphericalPolygon, axes: ArrayLike, order: int) -> Float[Array, "k n"]:
+    """Integrals of the cosine powers (w . axis)^n over a polygon, n = 0 ... order (Arvo 1995; CSH18 section 4).
+
+    Arguments: `polygon`; `axes` [K, 3], of any length but zero; static `order` N. Returns [K, N+1] in sr.
+    Sums of them with coefficients that alternate, such as those of Legendre polynomials, lose every digit near order 20
+    in float64 and 12 in float32: use `zonal_moments` for these.
+    Derivatives: in vertices and axes, both modes, first order exact where vertices coincide.
+    Accuracy: 1e-14 of the solid angle in float64 for polygons above 0.1 rad; smaller ones lose a factor of 1/size^2.
+    """
+    order = _checks.integer("order", order)
+    d = _checks.vectors("axes", axes)
+    if d.ndim != 2:
+        raise ValueError(f"`axes` must have shape [K, 3]; got {list(d.shape)}.")
+    if not isinstance(polygon, SphericalPolygon):
+        raise ValueError(f"`polygon` must be a domains.SphericalPolygon; got {type(polygon).__name__}.")
+    return _axial_moments(polygon, d, order)
+
+
+def polygon_coefficients(region: Region, degree: int) -> Float[Array, " n"]:
+    """SH coefficients of the indicator of a region: the integrals over it of every y_l^m, [(L+1)^2].
+
+    Derivatives: in the vertices, or axis and angle, as `zonal_moments`.
+    Accuracy: that of `zonal_moments` times the condition number of its axes, at most 9 up to degree 32 and 6 above.
+    Cost: `zonal_moments` for 2L+1 axes (4L+2 above degree 32), and (2L+1)^3 / 3 products.
+    """
+    degree = _checks.degree(degree)
+    _check_region(region)
+    return _coefficients(region, degree)
+
+
+def integrate(coefficients: ArrayLike, region: Region) -> Float[Array, "*batch"]:
+    """The integral of SH expansions over a region (CSH18 Eq. 1).
+
+    Arguments: `coefficients` [..., (L+1)^2]; a `SphericalPolygon` or `SphericalCap`. Returns [...].
+    Derivatives: in all floating arguments.
+    Accuracy: at degree 20, relative to the solid angle times the norm of the coefficients, 1e-14 in float64 and 1e-6 in
+    float32, at any size of the polygon.
+    """
+    c, degree = _checks.coefficients("coefficients", coefficients)
+    _check_region(region)
+    basis = _coefficients(region, degree)
+    dtype = jnp.promote_types(c.dtype, basis.dtype)
+    return jnp.einsum("...n,n->...", c.astype(dtype), basis.astype(dtype), precision="highest")
+
+
+def _check_region(region: object) -> None:
+    if not isinstance(region, SphericalPolygon | SphericalCap):
+        raise ValueError(
+            f"the region must be a domains.SphericalPolygon or domains.SphericalCap; got {type(region).__name__}."
+        )
+
+
+def _checked_axes(axes: Array) -> Array:
+    d = normalize(axes)
+    return eqx.error_if(d, ~jnp.all(jnp.isfinite(d)), "`axes` has a vector that is zero or not finite.")
+
+
+@eqx.filter_jit
+def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "k l"]:
+    d = _checked_axes(axes)
+    if isinstance(region, SphericalCap):
+        return region.zonal_integrals(degree)[None] * legendre(d @ region.axis.astype(d.dtype), degree)
+    v, d = _same_dtype(region.loop(), d)
+    angle = jnp.broadcast_to(loop_solid_angle(v, region.largest)[None, None], (1, d.shape[0], 1))
+    rest = [_moments.moments(d, v, degree)] if degree else []
+    return jnp.concatenate([angle, *rest])[..., 0].T
+
+
+@eqx.filter_jit
+def _axial_moments(polygon: SphericalPolygon, axes: Array, order: int) -> Float[Array, "k n"]:
+    v, d = _same_dtype(polygon.loop(), _checked_axes(axes))
+    return _moments.powers(d, v, loop_solid_angle(v, polygon.largest), order)[..., 0].T
+
+
+@eqx.filter_jit
+def _coefficients(region: Region, degree: int) -> Float[Array, " n"]:
+    if isinstance(region, SphericalCap):
+        scale = region.zonal_integrals(degree)[_tables.bands(degree)]
+        return scale * sh_basis(region.axis, degree)
+    v = region.loop()
+    return loop_coefficients(v, loop_solid_angle(v, region.largest), degree)[:, 0]
+
+
+def loop_coefficients(v: Loop, solid_angle: Float[Array, " p"], degree: int) -> Float[Array, "n p"]:
+    """Integrals of the basis over loops, [(L+1)^2, p]."""
+    constant = (solid_angle * np.sqrt(1 / (4 * np.pi)))[None]
+    if degree == 0:
+        return constant
+    axes, inverse = zonal_inverse(degree, v.dtype)
+    zonal = _moments.moments(jnp.asarray(axes), v, degree)  # l k p
+    bands = [jnp.asarray(inverse[l * l : (l + 1) ** 2]) @ zonal[l - 1] for l in range(1, degree + 1)]
+    return jnp.concatenate([constant, *bands])
+
+
+@functools.cache
+def zonal_inverse(degree: int, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
+    """Axes [K, 3], and the matrix [(L+1)^2, K] from I_l(z_k) to the integrals of y_l^m."""
+    with jax.ensure_compile_time_eval():
+        if degree <= _TABLE_DEGREE:
+            axes = np.asarray(optimized_directions(degree, dtype=dtype))
+        else:
+            axes = np.asarray(fibonacci_directions(2 * (2 * degree + 1), dtype=dtype))
+    z = axes.astype(float)
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    y = host_basis(z, degree)
+    bands = [np.linalg.pinv(4 * np.pi / (2 * l + 1) * y[:, l * l : (l + 1) ** 2]) for l in range(degree + 1)]
+    return axes, np.concatenate(bands).astype(dtype)
+
+
+def host_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """y_l^m [N, (L+1)^2] in float64 on the host."""
+    x, y, z = directions.T
+    m, l = _tables.orders(degree), _tables.bands(degree)
+    p = _tables.associated_legendre(np.arctan2(np.hypot(x, y), z), degree)[l, np.abs(m)].T
+    angle = np.outer(np.arctan2(y, x), np.abs(m))
+    return p * np.where(m == 0, 1, np.sqrt(2) * np.where(m > 0, np.cos(angle), np.sin(angle)))
+
+
+def _same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
+    dtype = jnp.promote_types(a.dtype, b.dtype)
+    return a.astype(dtype), b.astype(dtype)
