@@ -48,6 +48,8 @@ def shade_environment(
     """
     if not isinstance(lobes, Lobes):
         raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
+    if lobes.domain != "sphere":
+        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
     e, light_degree = _checks.coefficients("light_coefficients", light_coefficients)
     if e.ndim > 2:
         raise ValueError(f"`light_coefficients` must have shape [n] or [colour, n]; got {list(e.shape)}.")

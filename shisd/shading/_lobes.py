@@ -8,6 +8,7 @@ a = the unit vector at r that points up, b = horizontal; w is above the horizon 
 """
 
 import functools
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -28,12 +29,14 @@ class Lobes(eqx.Module):
     weights: [*colour, V, L+1, K] for isotropic materials, in views at elevations (j + 1/2) (pi/2)/V from the normal and
     azimuth 0 (the slice of azimuth phi is this one turned by phi); [*colour, V, A, L+1, K] for anisotropic ones, with
     azimuths 2 pi i/A. `quadrature_error`: the difference to a coarser rule, relative to the largest coefficient.
+    `domain`: where the slices stand for the material, everywhere or only above the horizon.
     """
 
     basis: RotatedZonalBasis
     weights: Float[Array, "*colour_views l k"]
     quadrature_error: Scalar
     isotropic: bool = eqx.field(static=True)
+    domain: Literal["sphere", "upper"] = eqx.field(static=True, default="sphere")
 
     @property
     def degree(self) -> int:
@@ -108,6 +111,8 @@ def tabulate_brdf(
     views: int = 64,
     azimuths: int = 32,
     quadrature: int | None = None,
+    domain: Literal["sphere", "upper"] = "sphere",
+    ridge: float = 1e-6,
     tolerance: float = 1e-3,
     throw: bool = True,
 ) -> Lobes:
@@ -118,6 +123,10 @@ def tabulate_brdf(
     in each eighth of a turn about it), by default 32 + degree. Every slice is integrated again with three quarters of
     the nodes: where that changes a coefficient by more than `tolerance` of the largest one, the table is an error at
     run time that says so; `throw=False` leaves it to the caller, in `Lobes.quadrature_error`.
+    `domain` "upper" fits the slices above the horizon only, for integrals over lights that are cut off there
+    (`shade_polygon`): the kink of the cosine is no longer expanded, and errors are up to 100 times smaller. `ridge`
+    limits what the fit may do below the horizon: rounding grows like 1/sqrt(ridge), measured 1e-5 in float32 at the
+    default.
     Derivatives: in every parameter of the material and in the lobe directions, both modes. The nodes follow
     `brdf.lobe_width`, through which no derivative passes.
     Accuracy: `quadrature_error` below 1e-4 for GGX down to alpha 0.05 at the default quadrature, in float32.
@@ -131,8 +140,13 @@ def tabulate_brdf(
     azimuths = _checks.integer("azimuths", azimuths, 4)
     if azimuths % 2:
         raise ValueError(f"`azimuths` must be even; got {azimuths}.")
+    if domain not in ("sphere", "upper"):
+        raise ValueError(f"`domain` must be 'sphere' or 'upper'; got {domain!r}.")
+    if not ridge > 0:
+        raise ValueError(f"`ridge` must be > 0; got {ridge}.")
+    fit = float(ridge) if domain == "upper" else None
     nodes = 32 + basis.degree if quadrature is None else _checks.integer("quadrature", quadrature, 4)
-    return _tabulate(brdf, basis, views, azimuths, nodes, float(tolerance), throw)
+    return _tabulate(brdf, basis, views, azimuths, nodes, fit, float(tolerance), throw)
 
 
 @eqx.filter_jit
@@ -142,6 +156,7 @@ def _tabulate(
     views: int,
     azimuths: int,
     quadrature: int,
+    ridge: float | None,
     tolerance: float,
     throw: bool,
 ) -> Lobes:
@@ -168,7 +183,30 @@ def _tabulate(
             "The quadrature does not resolve this material: a coarser rule differs by more than `tolerance`. "
             "Pass a larger `quadrature`, or throw=False and read `quadrature_error`.",
         )
-    return Lobes(basis, basis.weights(c), error, brdf.isotropic)
+    if ridge is not None:
+        modes, shares = _hemisphere_modes(basis.degree)
+        modes = jnp.asarray(modes, dtype)
+        c = ((c @ modes) * jnp.asarray(1 / (shares + ridge), dtype).reshape((1,) * (c.ndim - 1) + (-1,))) @ modes.T
+    return Lobes(basis, basis.weights(c), error, brdf.isotropic, "sphere" if ridge is None else "upper")
+
+
+@functools.cache
+def _hemisphere_modes(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal expansions [n, n], in columns, that are orthogonal on the upper hemisphere too, and their shares of it.
+
+    The eigenvectors of the matrix H of integrals of y_i y_j above the horizon, one block for every order m. With b the
+    projection of a function that vanishes below, the least squares fit above, regularised, is (H + ridge)^-1 b.
+    """
+    z, weight = np.polynomial.legendre.leggauss(degree + 1)
+    p = _tables.associated_legendre(np.arccos((z + 1) / 2), degree)  # exact: z alone is even or odd in each product
+    modes, shares = np.zeros(((degree + 1) ** 2,) * 2), np.zeros((degree + 1) ** 2)
+    for m in range(-degree, degree + 1):
+        l = np.arange(abs(m), degree + 1)
+        rows = p[l, abs(m)]
+        values, vectors = np.linalg.eigh(np.pi * (rows * weight) @ rows.T)
+        modes[np.ix_(l * l + l + m, l * l + l + m)] = vectors
+        shares[l * l + l + m] = np.maximum(values, 0)
+    return modes, shares
 
 
 def _project_slice(
