@@ -192,7 +192,7 @@ def _tabulate(
 
 @functools.cache
 def _hemisphere_modes(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal expansions [n, n], in columns, that are orthogonal on the upper hemisphere too, and their shares of it.
+    """Orthonormal expansions [n, n], in columns, orthogonal on the upper hemisphere too, and their shares of it.
 
     The eigenvectors of the matrix H of integrals of y_i y_j above the horizon, one block for every order m. With b the
     projection of a function that vanishes below, the least squares fit above, regularised, is (H + ridge)^-1 b.
