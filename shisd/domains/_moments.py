@@ -143,10 +143,8 @@ def powers(axes: Float[Array, "k 3"], v: Loop, solid_angle: Float[Array, " p"], 
     u0, u1 = terms.u0, terms.u1
     slope0 = terms.end_slope + terms.mean_u * arcs.angle[:, None]  # u'(a)
     inside, none, inverse_angle = 1 - terms.g2, arcs.none[:, None], arcs.inverse(arcs.angle)[:, None]
-    a, f = (
-        [jnp.broadcast_to(solid_angle[None], total.shape), 0.5 * total],
-        [jnp.ones_like(u0), terms.mean_u],
-    )  # F_n / theta
+    a = [jnp.broadcast_to(solid_angle[None], total.shape), 0.5 * total]
+    f = [jnp.ones_like(u0), terms.mean_u]  # F_n / theta
     p0, p1 = u0, u1
     for n in range(2, order + 1):
         ends = jnp.where(none, -p0 * u0, (p1 * terms.end_slope - p0 * slope0) * inverse_angle)
@@ -185,12 +183,10 @@ class _Arcs:
         self.sine = 2 * self.t / (1 + t2)
         self.normal = self.ratio[None] * _cross(v, jnp.where(self.short[None], chord, middle))  # theta n
         alpha = tau - kappa[None] * c
-        parts = self.ratio_1[None] * _cross(jnp.broadcast_to(c, v.shape), chord) + self.ratio[None] * _cross(
-            alpha, chord
-        )
-        long = self.normal - _cross(jnp.broadcast_to(c, v.shape), chord)  # the same where chords are not small
+        around = _cross(jnp.broadcast_to(c, v.shape), chord)  # these add up to 0
+        parts = self.ratio_1[None] * around + self.ratio[None] * _cross(alpha, chord)
+        long = self.normal - around  # the same, where the chord is not small
         self.total = _sum_edges(jnp.moveaxis(jnp.where(self.short[None], parts, long), 1, 0))  # sum of theta n
-
         # kept as arrays: XLA would compute all of this again for every axis
         names = sorted(vars(self))
         vars(self).update(zip(names, jax.lax.optimization_barrier([vars(self)[n] for n in names]), strict=True))
