@@ -53,9 +53,8 @@ def lobes_of(name, degree, dtype, domain="upper"):
     return shading.tabulate_brdf(BRDFS[name](), basis, domain=domain)
 
 
-@pytest.mark.parametrize(
-    ("name", "bound"), [("lambertian", 3e-5), pytest.param("glossy", 1e-4, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "bound"), [("lambertian", 3e-5), ("glossy", 1e-4)])
 def test_radiance_of_the_material(name, bound, dtype, rng):
     """Relative RMSE at degree 20, interpolation of views included; ordinary projection is many times worse."""
     position, normal, view = scene(rng, 16)
