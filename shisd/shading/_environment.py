@@ -10,16 +10,15 @@ notation: R = (t, b, n) local to world; e = light coefficients; R^T e = light in
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import normalize
 from shisd._typing import Array, Float
 from shisd.harmonics._rotation import rotate_many
-from shisd.shading._lobes import Lobes, lookup_table, slice_values
+from shisd.shading._lobes import Lobes, lookup_table
+from shisd.shading._surface import shade_tiles, surface
 
 _NUMBERS_AT_ONCE = 1 << 19  # coefficients of turned light held at a time: what one tile of pixels needs stays in cache
 
@@ -53,80 +52,24 @@ def shade_environment(
     e, light_degree = _checks.coefficients("light_coefficients", light_coefficients)
     if e.ndim > 2:
         raise ValueError(f"`light_coefficients` must have shape [n] or [colour, n]; got {list(e.shape)}.")
-    named = {"normals": normals, "views": views}
-    if not lobes.isotropic:
-        if tangents is None:
-            raise ValueError("`tangents` [..., 3] are needed: this material is anisotropic.")
-        named["tangents"] = tangents
-    arrays = {name: _checks.vectors(name, value) for name, value in named.items()}
-    shapes = {name: list(a.shape) for name, a in arrays.items()}
-    try:
-        shape = np.broadcast_shapes(*(a.shape for a in arrays.values()))
-        colour = np.broadcast_shapes(lobes.colour, e.shape[:-1])
-    except ValueError as error:
-        raise ValueError(
-            f"batch axes {shapes}, or colours of `lobes` {list(lobes.colour)} and `light_coefficients` "
-            f"{list(e.shape[:-1])}, do not broadcast."
-        ) from error
-    dtype = jnp.result_type(lobes.weights, e, *arrays.values())
-    frames = [jnp.broadcast_to(a.astype(dtype), shape).reshape(-1, 3) for a in arrays.values()]
+    light = [("light_coefficients", e.shape[:-1])]
+    lobes, points, shape, colour = surface(lobes, tangents, light, [e.dtype], normals=normals, views=views)
     degree = min(light_degree, lobes.degree)
-    lobes = jax.tree.map(lambda x: x.astype(dtype), lobes)
-    radiance = _shade(lobes, e[..., : (degree + 1) ** 2].astype(dtype), *frames)
-    return radiance.reshape(*shape[:-1], *colour)
+    radiance = _shade(lobes, e[..., : (degree + 1) ** 2].astype(lobes.weights.dtype), points, colour)
+    return radiance.reshape(*shape, *colour)
 
 
 @eqx.filter_jit
-def _shade(lobes: Lobes, e: Float[Array, "*c n"], *frames: Float[Array, "p 3"]) -> Float[Array, " p *colour"]:
+def _shade(
+    lobes: Lobes, e: Float[Array, "*c n"], points: dict[str, Float[Array, "p 3"]], colour: tuple[int, ...]
+) -> Float[Array, " p *colour"]:
     degree = int(np.sqrt(e.shape[-1])) - 1
-    table = lookup_table(lobes, degree)
-    colour = np.broadcast_shapes(lobes.colour, e.shape[:-1])
-    count = frames[0].shape[0]
-    if count == 0:
-        return jnp.zeros((0, *colour), e.dtype)
-    size = min(count, 2048, 1 << max(1, _NUMBERS_AT_ONCE // e.size).bit_length() - 1)
-    tiles = -(-count // size)
-    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
 
-    @jax.checkpoint
-    def shade_tile(tile: tuple[Array, ...]) -> Float[Array, " p *colour"]:
-        normal, view, *tangent = (normalize(a) for a in tile)
-        r = _frame(normal) if lobes.isotropic else _tangent_frame(normal, tangent[0])
-        light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(r, 1, 2), degree, lobes.isotropic)
-        local = jnp.einsum("pij,pi->pj", r, view)
-        slices = slice_values(table, local, lobes)  # [*colour, n, p]
-        light = jnp.moveaxis(light.reshape(light.shape[0], *e.shape[:-1], size), 0, -2)
+    def radiance(frame: Float[Array, "p 3 3"], slices: Float[Array, "*s n p"]) -> Float[Array, "*colour p"]:
+        light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(frame, 1, 2), degree, lobes.isotropic)
+        light = jnp.moveaxis(light.reshape(light.shape[0], *e.shape[:-1], -1), 0, -2)
         shape = (*colour, *light.shape[-2:])
-        radiance = jnp.sum(jnp.broadcast_to(slices, shape) * jnp.broadcast_to(light, shape), axis=-2)
-        return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(radiance, -1, 0))
+        return jnp.sum(jnp.broadcast_to(slices, shape) * jnp.broadcast_to(light, shape), axis=-2)
 
-    radiance = jax.lax.map(shade_tile, tuple(fill(a) for a in frames))
-    return radiance.reshape(tiles * size, *radiance.shape[2:])[:count]
-
-
-@jax.custom_jvp
-def _frame(normal: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
-    """R with R z = n and R^T z = (sin, 0, cos), for isotropic materials, which do not mind a turn about n.
-
-    No choice of such frames is smooth everywhere. But what they are used for does not depend on the choice, so its
-    derivative may follow any: the frame that turns no more than the normal does, about n x dn.
-    """
-    x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
-    rho = jnp.sqrt(x * x + y * y)
-    safe = jnp.where(rho > 0, rho, 1)
-    cos, sin, zero = jnp.where(rho > 0, x / safe, 1), y / safe, jnp.zeros_like(x)
-    rows = [[-cos * z, sin, x], [-sin * z, -cos, y], [rho, zero, z]]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-@_frame.defjvp
-def _frame_jvp(primals, tangents):
-    (normal,), (dn,) = primals, tangents
-    r = _frame(normal)
-    return r, jnp.cross(jnp.cross(normal, dn)[:, :, None], r, axis=1)
-
-
-def _tangent_frame(normal: Float[Array, "p 3"], tangent: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
-    """R = (t, b, n), t along the part of the tangent that is orthogonal to n."""
-    t = normalize(tangent - jnp.sum(normal * tangent, axis=-1, keepdims=True) * normal)
-    return jnp.stack([t, jnp.cross(normal, t), normal], axis=-1)
+    size = min(2048, 1 << max(1, _NUMBERS_AT_ONCE // e.size).bit_length() - 1)
+    return shade_tiles(lobes, lookup_table(lobes, degree), points, colour, size, radiance)

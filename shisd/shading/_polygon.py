@@ -13,15 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float
 from shisd.domains import _moments
 from shisd.domains._integrate import zonal_inverse
 from shisd.domains._polygon import clip, loop_solid_angle
 from shisd.models import PolygonLight
-from shisd.shading._environment import _frame, _tangent_frame
-from shisd.shading._lobes import Lobes, lookup_table, slice_values
+from shisd.shading._lobes import Lobes, lookup_table
+from shisd.shading._surface import shade_tiles, surface
 
 _TILE = 128  # pixels at a time
 
@@ -52,56 +51,39 @@ def shade_polygon(
     lights = (light,) if isinstance(light, PolygonLight) else tuple(light)
     if not lights or not all(isinstance(x, PolygonLight) for x in lights):
         raise ValueError("`light` must be a models.PolygonLight or a sequence of at least one.")
-    named = {"positions": positions, "normals": normals, "views": views}
-    if not lobes.isotropic:
-        if tangents is None:
-            raise ValueError("`tangents` [..., 3] are needed: this material is anisotropic.")
-        named["tangents"] = tangents
-    arrays = {name: _checks.vectors(name, value) for name, value in named.items()}
-    try:
-        shape = np.broadcast_shapes(*(a.shape for a in arrays.values()))
-        colour = np.broadcast_shapes(lobes.colour, *(x.emission.shape for x in lights))
-    except ValueError as error:
-        shapes = {name: list(a.shape) for name, a in arrays.items()}
-        raise ValueError(f"batch axes {shapes}, or colours of `lobes` and `light`, do not broadcast.") from error
-    dtype = jnp.result_type(lobes.weights, *arrays.values(), *(x.points for x in lights))
-    flat = [jnp.broadcast_to(a.astype(dtype), shape).reshape(-1, 3) for a in arrays.values()]
-    lobes, lights = jax.tree.map(lambda x: x.astype(dtype), (lobes, lights))
-    return _shade(lobes, lights, *flat).reshape(*shape[:-1], *colour)
+    emission = [(f"light {i}", x.emission.shape) for i, x in enumerate(lights)]
+    dtypes = [x.points.dtype for x in lights]
+    vectors = {"positions": positions, "normals": normals, "views": views}
+    lobes, points, shape, colour = surface(lobes, tangents, emission, dtypes, **vectors)
+    lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
+    return _shade(lobes, lights, points, colour).reshape(*shape, *colour)
 
 
 @eqx.filter_jit
-def _shade(lobes: Lobes, lights: tuple[PolygonLight, ...], *frames: Float[Array, "p 3"]) -> Array:
+def _shade(
+    lobes: Lobes,
+    lights: tuple[PolygonLight, ...],
+    points: dict[str, Float[Array, "p 3"]],
+    colour: tuple[int, ...],
+) -> Float[Array, " p *colour"]:
     degree, table = lobes.degree, lookup_table(lobes)
-    colour = np.broadcast_shapes(lobes.colour, *(x.emission.shape for x in lights))
-    count = frames[0].shape[0]
-    if count == 0:
-        return jnp.zeros((0, *colour), table.dtype)
-    size = min(count, _TILE)
-    tiles = -(-count // size)
-    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
+    axes = jnp.asarray(zonal_inverse(degree, table.dtype)[0])
 
-    @jax.checkpoint
-    def shade_tile(tile: tuple[Array, ...]) -> Float[Array, " p *colour"]:
-        position, *directions = tile
-        normal, view, *tangent = (normalize(a) for a in directions)
-        r = _frame(normal) if lobes.isotropic else _tangent_frame(normal, tangent[0])
-        local = jnp.einsum("pij,pi->pj", r, view)
-        slices = slice_values(table, local, lobes).reshape(-1, table.shape[-2], size)
+    def radiance(
+        frame: Float[Array, "p 3 3"], slices: Float[Array, "*s n p"], positions: Float[Array, "p 3"]
+    ) -> Float[Array, "*colour p"]:
+        slices = slices.reshape(-1, *slices.shape[-2:])
         weights = [_zonal_weights(s, degree) for s in slices]
-        radiance = jnp.zeros((size, *colour), table.dtype)
+        total = jnp.zeros((*colour, positions.shape[0]), table.dtype)
         for light in lights:
-            v, solid_angle, facing = _outline(light, position, r)
+            v, solid_angle, facing = _outline(light, positions, frame)
             constant = slices[:, 0] * (solid_angle * np.sqrt(1 / (4 * np.pi)))[None]
-            axes = jnp.asarray(zonal_inverse(degree, v.dtype)[0])
             rest = jnp.stack([_moments.fold(w, axes, v, degree) for w in weights])
-            lit = jnp.moveaxis(((constant + rest) * facing[None]).reshape(*lobes.colour, size), -1, 0)
-            pad = (1,) * (len(colour) - len(lobes.colour))
-            radiance += lit.reshape(size, *pad, *lobes.colour) * jnp.broadcast_to(light.emission, colour)[None]
-        return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, radiance)
+            lit = ((constant + rest) * facing[None]).reshape(*lobes.colour, -1)
+            total += jnp.broadcast_to(lit, total.shape) * jnp.broadcast_to(light.emission[..., None], total.shape)
+        return total
 
-    radiance = jax.lax.map(shade_tile, tuple(fill(a) for a in frames))
-    return radiance.reshape(tiles * size, *colour)[:count]
+    return shade_tiles(lobes, table, points, colour, _TILE, radiance)
 
 
 def _outline(light: PolygonLight, position: Array, r: Array) -> tuple[Array, Array, Array]:

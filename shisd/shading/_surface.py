@@ -1,0 +1,107 @@
+"""Surface points, as every shading verb takes them: their checks, their frames, and one tile of them after another."""
+
+from collections.abc import Callable, Iterable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+
+from shisd import _checks
+from shisd._numerics import normalize
+from shisd._typing import Array, Float
+from shisd.shading._lobes import Lobes, slice_values
+
+Shape = tuple[int, ...]
+_DIRECTIONS = ("normals", "views", "tangents")
+
+
+def surface(
+    lobes: Lobes,
+    tangents: ArrayLike | None,
+    light: Iterable[tuple[str, Shape]],
+    dtypes: Iterable[DTypeLike],
+    **vectors: ArrayLike,
+) -> tuple[Lobes, dict[str, Array], Shape, Shape]:
+    """Lobes and flat arrays [p, 3] in the common dtype, the batch shape, and the colour of lobes and `light` together.
+
+    `tangents` are taken where the material needs them, `light` names the colour axes of each light.
+    """
+    if not lobes.isotropic:
+        if tangents is None:
+            raise ValueError("`tangents` [..., 3] are needed: this material is anisotropic.")
+        vectors["tangents"] = tangents
+    arrays = {name: _checks.vectors(name, value) for name, value in vectors.items()}
+    colours = [("lobes", lobes.colour), *light]
+    try:
+        shape = np.broadcast_shapes(*(a.shape for a in arrays.values()))
+        colour = np.broadcast_shapes(*(c for _, c in colours))
+    except ValueError as error:
+        shapes = {name: list(a.shape) for name, a in arrays.items()}
+        named = " and ".join(f"`{name}` {list(c)}" for name, c in colours)
+        raise ValueError(f"batch axes {shapes}, or colours of {named}, do not broadcast.") from error
+    dtype = jnp.result_type(lobes.weights, *dtypes, *arrays.values())
+    flat = {name: jnp.broadcast_to(a.astype(dtype), shape).reshape(-1, 3) for name, a in arrays.items()}
+    return jax.tree.map(lambda x: x.astype(dtype), lobes), flat, shape[:-1], colour
+
+
+def shade_tiles(
+    lobes: Lobes,
+    table: Array,
+    points: dict[str, Float[Array, "p 3"]],
+    colour: Shape,
+    size: int,
+    radiance: Callable[..., Float[Array, "*colour p"]],
+) -> Float[Array, " p *colour"]:
+    """`radiance(frame, slices, **others)` of all points, `size` at a time; 0 where the view is below the horizon.
+
+    `frame` [p, 3, 3] is local to world, `slices` [*colour, n, p] are the material's coefficients in it, and `others`
+    the `points` of the tile that are not directions. The backward pass makes each tile again.
+    """
+    count = points["normals"].shape[0]
+    if count == 0:
+        return jnp.zeros((0, *colour), table.dtype)
+    size = min(count, size)
+    tiles = -(-count // size)
+    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
+
+    @jax.checkpoint
+    def shade_tile(tile: dict[str, Array]) -> Float[Array, " p *colour"]:
+        directions = {name: normalize(a) for name, a in tile.items() if name in _DIRECTIONS}
+        others = {name: a for name, a in tile.items() if name not in _DIRECTIONS}
+        normal = directions["normals"]
+        r = frame(normal) if lobes.isotropic else tangent_frame(normal, directions["tangents"])
+        local = jnp.einsum("pij,pi->pj", r, directions["views"])
+        values = radiance(r, slice_values(table, local, lobes), **others)
+        return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(values, -1, 0))
+
+    values = jax.lax.map(shade_tile, {name: fill(a) for name, a in points.items()})
+    return values.reshape(tiles * size, *colour)[:count]
+
+
+@jax.custom_jvp
+def frame(normal: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
+    """R with R z = n and R^T z = (sin, 0, cos), for isotropic materials, which do not mind a turn about n.
+
+    No choice of such frames is smooth everywhere. But what they are used for does not depend on the choice, so its
+    derivative may follow any: the frame that turns no more than the normal does, about n x dn.
+    """
+    x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
+    rho = jnp.sqrt(x * x + y * y)
+    safe = jnp.where(rho > 0, rho, 1)
+    cos, sin, zero = jnp.where(rho > 0, x / safe, 1), y / safe, jnp.zeros_like(x)
+    rows = [[-cos * z, sin, x], [-sin * z, -cos, y], [rho, zero, z]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@frame.defjvp
+def _frame_jvp(primals, tangents):
+    (normal,), (dn,) = primals, tangents
+    r = frame(normal)
+    return r, jnp.cross(jnp.cross(normal, dn)[:, :, None], r, axis=1)
+
+
+def tangent_frame(normal: Float[Array, "p 3"], tangent: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
+    """R = (t, b, n), t along the part of the tangent that is orthogonal to n."""
+    t = normalize(tangent - jnp.sum(normal * tangent, axis=-1, keepdims=True) * normal)
+    return jnp.stack([t, jnp.cross(normal, t), normal], axis=-1)
