@@ -37,3 +37,19 @@ def _chain(cos: Array, sin: Array, count: int) -> tuple[list[Array], list[Array]
         c.append(c[i] * c[j] - s[i] * s[j])
         s.append(s[i] * c[j] + c[i] * s[j])
     return c[:count], s[:count]
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Scalar products of vectors whose components are on the first axis."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector products, components on the first axis."""
+    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def safe_sqrt(x: Array) -> Array:
+    """Square roots whose derivative at 0 is 0, not infinite."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)

@@ -43,6 +43,7 @@ POLYGONS = {
 
 def padded(vertices):
     """`vertices` in SLOTS slots, so that one compiled function serves all."""
+    assert len(vertices) <= SLOTS
     fill = np.repeat(vertices[:1], SLOTS - len(vertices), axis=0)
     return np.concatenate([vertices, fill])
 

@@ -23,7 +23,7 @@ from shisd._numerics import normalize
 from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import legendre
 
-_TABLE_DEGREE = 32
+TABLE_DEGREE = 32
 
 
 def fibonacci_directions(count: int, *, dtype: DTypeLike = float) -> Float[Array, "{count} 3"]:
@@ -66,9 +66,9 @@ def optimized_directions(degree: int, *, dtype: DTypeLike = float) -> Float[Arra
     Source: `optimize_directions` from many starts; tests/bench/make_directions.py makes the table.
     """
     degree = _checks.degree(degree)
-    if degree > _TABLE_DEGREE:
+    if degree > TABLE_DEGREE:
         raise ValueError(
-            f"`degree` must be <= {_TABLE_DEGREE}, where the table ends; got {degree}. Use "
+            f"`degree` must be <= {TABLE_DEGREE}, where the table ends; got {degree}. Use "
             f"decomposition.fibonacci_directions({2 * degree + 1}), and improve them with "
             "decomposition.optimize_directions if their condition numbers matter."
         )

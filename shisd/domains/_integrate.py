@@ -19,6 +19,7 @@ from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float
 from shisd.decomposition import fibonacci_directions, optimized_directions
+from shisd.decomposition._directions import TABLE_DEGREE
 from shisd.domains import _moments
 from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, loop_solid_angle
@@ -26,7 +27,6 @@ from shisd.domains._region import SphericalCap
 from shisd.harmonics import _tables, legendre, sh_basis
 
 Region = SphericalPolygon | SphericalCap
-_TABLE_DEGREE = 32  # where the table of optimised axes ends
 
 
 def zonal_moments(region: Region, axes: ArrayLike, degree: int) -> Float[Array, "k l"]:
@@ -42,9 +42,7 @@ def zonal_moments(region: Region, axes: ArrayLike, degree: int) -> Float[Array, 
     Cost: one sweep over the degrees, about 30 operations for every degree, axis and edge.
     """
     degree = _checks.degree(degree)
-    d = _checks.vectors("axes", axes)
-    if d.ndim != 2:
-        raise ValueError(f"`axes` must have shape [K, 3]; got {list(d.shape)}.")
+    d = _axes(axes)
     _check_region(region)
     return _zonal_moments(region, d, degree)
 
@@ -59,9 +57,7 @@ def axial_moments(polygon: SphericalPolygon, axes: ArrayLike, order: int) -> Flo
     Accuracy: 1e-14 of the solid angle in float64 for polygons above 0.1 rad; smaller ones lose a factor of 1/size^2.
     """
     order = _checks.integer("order", order)
-    d = _checks.vectors("axes", axes)
-    if d.ndim != 2:
-        raise ValueError(f"`axes` must have shape [K, 3]; got {list(d.shape)}.")
+    d = _axes(axes)
     if not isinstance(polygon, SphericalPolygon):
         raise ValueError(f"`polygon` must be a domains.SphericalPolygon; got {type(polygon).__name__}.")
     return _axial_moments(polygon, d, order)
@@ -92,6 +88,13 @@ def integrate(coefficients: ArrayLike, region: Region) -> Float[Array, "*batch"]
     basis = _coefficients(region, degree)
     dtype = jnp.promote_types(c.dtype, basis.dtype)
     return jnp.einsum("...n,n->...", c.astype(dtype), basis.astype(dtype), precision="highest")
+
+
+def _axes(axes: ArrayLike) -> Float[Array, "k 3"]:
+    d = _checks.vectors("axes", axes)
+    if d.ndim != 2:
+        raise ValueError(f"`axes` must have shape [K, 3]; got {list(d.shape)}.")
+    return d
 
 
 def _check_region(region: object) -> None:
@@ -147,24 +150,15 @@ def loop_coefficients(v: Loop, solid_angle: Float[Array, " p"], degree: int) -> 
 def zonal_inverse(degree: int, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
     """Axes [K, 3], and the matrix [(L+1)^2, K] from I_l(z_k) to the integrals of y_l^m."""
     with jax.ensure_compile_time_eval():
-        if degree <= _TABLE_DEGREE:
+        if degree <= TABLE_DEGREE:
             axes = np.asarray(optimized_directions(degree, dtype=dtype))
         else:
             axes = np.asarray(fibonacci_directions(2 * (2 * degree + 1), dtype=dtype))
     z = axes.astype(float)
     z /= np.linalg.norm(z, axis=1, keepdims=True)
-    y = host_basis(z, degree)
+    y = _tables.basis(z, degree)
     bands = [np.linalg.pinv(4 * np.pi / (2 * l + 1) * y[:, l * l : (l + 1) ** 2]) for l in range(degree + 1)]
     return axes, np.concatenate(bands).astype(dtype)
-
-
-def host_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """y_l^m [N, (L+1)^2] in float64 on the host."""
-    x, y, z = directions.T
-    m, l = _tables.orders(degree), _tables.bands(degree)
-    p = _tables.associated_legendre(np.arctan2(np.hypot(x, y), z), degree)[l, np.abs(m)].T
-    angle = np.outer(np.arctan2(y, x), np.abs(m))
-    return p * np.where(m == 0, 1, np.sqrt(2) * np.where(m > 0, np.cos(angle), np.sin(angle)))
 
 
 def _same_dtype(a: Array, b: Array) -> tuple[Array, Array]:

@@ -36,10 +36,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from shisd._numerics import cross, dot, safe_sqrt
 from shisd._typing import Array, Float
 
 Loop = Float[Array, "3 s p"]
-Edges = Float[Array, "s k p"]
 
 _UNROLLED = 32  # up to this degree a sweep is one straight line of code, which XLA keeps in registers
 
@@ -49,18 +49,19 @@ def fold(weights: Float[Array, "l k q"], axes: Float[Array, "k 3"], v: Loop, deg
     """sum over l >= 1 and k of weights[l, k] I_l(axes[k]) for every polygon. Weights may be shared (q = 1)."""
     if degree == 0:
         return jnp.zeros(v.shape[2:], v.dtype)
-    terms, total = _zonal_terms(v, axes)
+    terms, total = _zonal_terms(_arcs(v), axes)
     value = _sum_all(0.5 * weights[1] * total)
     if degree == 1:
         return value
+    flat = _flat(weights, total)
 
-    def step(state: tuple, n: tuple, w: Array, edge: _Zonal) -> tuple:
+    def step(state: tuple, n: _Factors, w: Array, edge: _Zonal) -> tuple:
         *rest, value = state
         following, change = edge.advance(tuple(rest), n)
-        return *following, value + (n[5] * w) * change
+        return *following, value + (n.laplacian * w) * change
 
     for edge in _edges(terms):
-        *_, part = _sweep(step, (*edge.start(), jnp.zeros_like(edge.u0)), degree, _flat(weights, total), edge)
+        *_, part = _sweep(step, (*edge.start(), jnp.zeros_like(edge.u0)), degree, flat, edge)
         value += _sum_all(part.reshape(total.shape))
     return value
 
@@ -73,11 +74,11 @@ def _fold_jvp(degree, primals, tangents):
         return value, change
     if not isinstance(d_weights, SymbolicZero):
         change += _sum_all(moments(axes, v, degree) * d_weights[1:])
-    speeds = _edge_speeds(axes, v, d_axes, dv)
-    if speeds is not None:
-        terms = _boundary_terms(v, axes)
+    if not (isinstance(d_axes, SymbolicZero) and isinstance(dv, SymbolicZero)):
+        arcs = _arcs(v)
+        terms, speeds = _boundary_terms(arcs, axes), _edge_speeds(arcs, axes, d_axes, dv)
 
-        def step(state: tuple, n: tuple, w: Array, edge: _Boundary) -> tuple:
+        def step(state: tuple, n: _Factors, w: Array, edge: _Boundary) -> tuple:
             *rest, middle, chord = state
             following, middle_l, chord_l = edge.advance(tuple(rest), n)
             return *following, middle + w * middle_l, chord + w * chord_l
@@ -100,33 +101,33 @@ fold.defjvp(_fold_jvp, symbolic_zeros=True)
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def moments(axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, "l k p"]:
     """I_l(axes[k]) for l = 1 ... degree."""
-    terms, total = _zonal_terms(v, axes)
+    terms, total = _zonal_terms(_arcs(v), axes)
     first = 0.5 * total
     if degree == 1:
         return first[None]
 
-    def step(state: tuple, n: tuple) -> tuple[tuple, Array]:
+    def step(state: tuple, n: _Factors) -> tuple[tuple, Array]:
         state, change = terms.advance(state, n)
-        return state, n[5] * _sum_edges(change)
+        return state, n.laplacian * _sum_edges(change)
 
-    _, rest = jax.lax.scan(step, terms.start(), _factors(np.arange(2, degree + 1), v.dtype))
+    _, rest = jax.lax.scan(step, terms.start(), _factors(2, degree, v.dtype))
     return jnp.concatenate([first[None], rest])
 
 
 def _moments_jvp(degree, primals, tangents):
     (axes, v), (d_axes, dv) = primals, tangents
     values = moments(axes, v, degree)
-    speeds = _edge_speeds(axes, v, d_axes, dv)
-    if speeds is None:
+    if isinstance(d_axes, SymbolicZero) and isinstance(dv, SymbolicZero):
         return values, jnp.zeros_like(values)
-    terms = _boundary_terms(v, axes)
+    arcs = _arcs(v)
+    terms, speeds = _boundary_terms(arcs, axes), _edge_speeds(arcs, axes, d_axes, dv)
 
-    def step(state: tuple, n: tuple) -> tuple[tuple, Array]:
+    def step(state: tuple, n: _Factors) -> tuple[tuple, Array]:
         state, middle, chord = terms.advance(state, n)
         a, b = terms.at_vertices(middle, chord)
         return state, _sum_edges(speeds[0] * a + speeds[1] * b)
 
-    _, change = jax.lax.scan(step, terms.start(), _factors(np.arange(1, degree + 1), v.dtype))
+    _, change = jax.lax.scan(step, terms.start(), _factors(1, degree, v.dtype))
     return values, -change
 
 
@@ -138,8 +139,8 @@ def powers(axes: Float[Array, "k 3"], v: Loop, solid_angle: Float[Array, " p"], 
 
     n F_n = (n-1) (1 - g^2) F_{n-2} - [u^(n-1) u'] along the edges, (n+1) A_n = (n-1) A_{n-2} + sum of g F_{n-1}.
     """
-    arcs = _Arcs(v)
-    terms, total = _zonal_terms(v, axes)
+    arcs = _arcs(v)
+    terms, total = _zonal_terms(arcs, axes)
     u0, u1 = terms.u0, terms.u1
     slope0 = terms.end_slope + terms.mean_u * arcs.angle[:, None]  # u'(a)
     inside, none, inverse_angle = 1 - terms.g2, arcs.none[:, None], arcs.inverse(arcs.angle)[:, None]
@@ -154,46 +155,82 @@ def powers(axes: Float[Array, "k 3"], v: Loop, solid_angle: Float[Array, " p"], 
     return jnp.stack(a[: order + 1])
 
 
-class _Arcs:
-    """The edges of polygons, without reference to an axis."""
+class _Factors(NamedTuple):
+    """The numbers in the recurrences for degree l."""
 
-    def __init__(self, v: Loop):
-        c = jax.lax.stop_gradient(v[:, :1])  # nothing depends on the choice of c
-        offset = v - c
-        tau = offset - _dot(offset, c)[None] * c
-        cosine = _dot(v, c)
-        near = cosine > 0.5
-        tau2 = _dot(tau, tau)
-        kappa = jnp.where(near, tau2 / (1 + jnp.sqrt(jnp.where(near, 1 - tau2, 1))), 1 - cosine)
-        following = jnp.roll(v, -1, 1)
-        self.c, self.tau, self.kappa = c[:, 0], tau, kappa
-        self.tau_next, self.kappa_next = jnp.roll(tau, -1, 1), jnp.roll(kappa, -1, 0)
-        self.d_tau, self.d_kappa = self.tau_next - tau, self.kappa_next - kappa
-        chord, middle = self.d_tau - self.d_kappa[None] * c, v + following
-        chord2, middle2 = _dot(chord, chord), _dot(middle, middle)
-        t2 = chord2 / middle2
-        self.none = t2 < (64 * jnp.finfo(v.dtype).eps) ** 2  # no direction: its recurrence is that of a point
-        self.half_sine, self.half_cosine = (0.5 * _sqrt(x) for x in (chord2, middle2))
-        self.t = _sqrt(t2)
-        self.tail = _arctan_tail(t2)
-        self.angle = 2 * self.t * (1 + self.tail)
-        self.short = t2 < 1
-        # theta / sin(theta), and that minus 1
-        self.ratio, self.ratio_1 = (1 + t2) * (1 + self.tail), t2 + self.tail * (1 + t2)
-        self.sine = 2 * self.t / (1 + t2)
-        self.normal = self.ratio[None] * _cross(v, jnp.where(self.short[None], chord, middle))  # theta n
-        alpha = tau - kappa[None] * c
-        around = _cross(jnp.broadcast_to(c, v.shape), chord)  # these add up to 0
-        parts = self.ratio_1[None] * around + self.ratio[None] * _cross(alpha, chord)
-        long = self.normal - around  # the same, where the chord is not small
-        self.total = _sum_edges(jnp.moveaxis(jnp.where(self.short[None], parts, long), 1, 0))  # sum of theta n
-        # kept as arrays: XLA would compute all of this again for every axis
-        names = sorted(vars(self))
-        vars(self).update(zip(names, jax.lax.optimization_barrier([vars(self)[n] for n in names]), strict=True))
+    up: Array | np.ndarray  # (2l-1)/l
+    back: Array | np.ndarray  # (l-1)/l
+    back2: Array | np.ndarray  # ((l-1)/l)^2
+    source: Array | np.ndarray  # (2l-1)/l^2
+    odd: Array | np.ndarray  # 2l-1
+    laplacian: Array | np.ndarray  # 1/(l(l+1))
+    next: Array | np.ndarray  # 1/(l+1)
+
+
+def _factors(first: int, degree: int, dtype: jnp.dtype) -> _Factors:
+    """Of degrees `first` ... `degree`, on the host."""
+    l = np.arange(first, degree + 1.0)
+    odd = 2 * l - 1
+    values = (odd / l, (l - 1) / l, ((l - 1) / l) ** 2, odd / l**2, odd, 1 / (l * (l + 1)), 1 / (l + 1))
+    return _Factors(*(x.astype(dtype) for x in values))
+
+
+class _Arcs(NamedTuple):
+    """The edges a -> b of polygons, without reference to an axis, each [vertex, p] or [x y z, vertex, p]."""
+
+    start: Array
+    end: Array
+    c: Array  # the reference vertex [x y z, p]
+    tau: Array  # a = c + tau - kappa c
+    tau_next: Array
+    kappa: Array
+    kappa_next: Array
+    chord: Array  # b - a
+    none: Array  # so short that it has no direction: its recurrence is that of a point
+    short: Array  # below a right angle
+    t: Array  # tan(theta/2)
+    tail: Array  # arctan(t)/t - 1
+    angle: Array  # theta
+    sine: Array
+    half_sine: Array  # sin(theta/2)
+    half_cosine: Array
+    ratio_1: Array  # theta / sin(theta) - 1
+    normal: Array  # theta n
+    total: Array  # its sum over the edges [x y z, p]
 
     def inverse(self, x: Array) -> Array:
         """1/x, 0 on edges of no length."""
         return jnp.where(self.none, 0, 1 / jnp.where(self.none, 1, x))
+
+
+def _arcs(v: Loop) -> _Arcs:
+    c = jax.lax.stop_gradient(v[:, :1])  # nothing depends on the choice of c
+    offset = v - c
+    tau = offset - dot(offset, c)[None] * c
+    cosine = dot(v, c)
+    near = cosine > 0.5
+    tau2 = dot(tau, tau)
+    kappa = jnp.where(near, tau2 / (1 + jnp.sqrt(jnp.where(near, 1 - tau2, 1))), 1 - cosine)
+    end, tau_next, kappa_next = jnp.roll(v, -1, 1), jnp.roll(tau, -1, 1), jnp.roll(kappa, -1, 0)
+    chord, middle = tau_next - tau - (kappa_next - kappa)[None] * c, v + end
+    chord2, middle2 = dot(chord, chord), dot(middle, middle)
+    t2 = chord2 / middle2
+    short = t2 < 1
+    t, tail = safe_sqrt(t2), _arctan_tail(t2)
+    ratio, ratio_1 = (1 + t2) * (1 + tail), t2 + tail * (1 + t2)  # theta / sin(theta)
+    normal = ratio[None] * cross(v, jnp.where(short[None], chord, middle))
+    around = cross(jnp.broadcast_to(c, v.shape), chord)  # these add up to 0
+    parts = ratio_1[None] * around + ratio[None] * cross(tau - kappa[None] * c, chord)
+    long = normal - around  # the same, where the chord is not small
+    arcs = _Arcs(
+        v, end, c[:, 0], tau, tau_next, kappa, kappa_next, chord,
+        none=t2 < (64 * jnp.finfo(v.dtype).eps) ** 2, short=short,
+        t=t, tail=tail, angle=2 * t * (1 + tail), sine=2 * t / (1 + t2),
+        half_sine=0.5 * safe_sqrt(chord2), half_cosine=0.5 * safe_sqrt(middle2),
+        ratio_1=ratio_1, normal=normal,
+        total=_sum_edges(jnp.moveaxis(jnp.where(short[None], parts, long), 1, 0)),
+    )  # fmt: skip
+    return jax.lax.optimization_barrier(arcs)  # kept as arrays: XLA would compute them again for every axis
 
 
 class _Zonal(NamedTuple):
@@ -208,10 +245,8 @@ class _Zonal(NamedTuple):
     mean_u: Array  # E_1 / theta
     g2: Array
     along: Array  # G = theta g
-    of_value: (
-        Array  # coefficients of P_l(u_c) and of P_l'(u_c) in the difference of [u' P_l] + g^2 D_l to its value at c
-    )
-    of_derivative: Array
+    of_value: Array  # coefficients, in the difference of [u' P_l] + g^2 D_l to its value at c, of P_l(u_c) ...
+    of_derivative: Array  # ... and of P_l'(u_c)
     sign: Array  # of u_c
     gap: Array  # 1 - |u_c|
     share: Array  # T over the number of edges
@@ -221,41 +256,41 @@ class _Zonal(NamedTuple):
         reference = (-self.gap, 1 - self.gap, self.sign, one, zero, one)
         return zero, self.y0, zero, zero, zero, -self.of_value, zero, zero, *reference
 
-    def advance(self, state: tuple, n: tuple) -> tuple[tuple, Array]:
+    def advance(self, state: tuple, n: _Factors) -> tuple[tuple, Array]:
         """From degree l-1 to l: the new state, and what the edge adds to l (l+1) I_l."""
         q0, q, dq0, dq, e0, e, s0, s, step_c, size_c, sign_c, p_c0, r_c0, r_c = state
-        up, back, back2, source, odd, *_ = n
+        up, back = n.up, n.back
         p_c = sign_c * size_c
         ends = self.end_slope * dq - self.mean_u * q + self.g2 * s + self.of_value * p_c + self.of_derivative * r_c
-        e_next, s_next = back2 * e0 - source * ends, s0 + odd * e
+        e_next, s_next = n.back2 * e0 - n.source * ends, s0 + n.odd * e
         dq_next = up * (self.u1 * dq + self.slope * (q + self.y1 * r_c)) - back * dq0
         q_next = up * (self.u0 * q + self.y0 * p_c) - back * q0
         # |P_l| of |u_c| by its differences in l, exact near u_c = +-1
         step_c = back * step_c - up * self.gap * size_c
-        r_next = r_c0 + odd * p_c
+        r_next = r_c0 + n.odd * p_c
         reference = (step_c, size_c + step_c, sign_c * self.sign, p_c, r_c, r_next)
         change = s_next * self.along + r_next * self.share
         return (q, q_next, dq, dq_next, e, e_next, s, s_next, *reference), change
 
 
-def _zonal_terms(v: Loop, axes: Float[Array, "k 3"]) -> tuple[_Zonal, Float[Array, "k p"]]:
+def _zonal_terms(arcs: _Arcs, axes: Float[Array, "k 3"]) -> tuple[_Zonal, Float[Array, "k p"]]:
     """The terms [e, k, p], and T."""
-    arcs = _Arcs(v)
     d, c = axes.T[:, :, None], arcs.c[:, None]
     # c . d and differences to it, exact also where d is near c or -c
-    sign = jnp.where(_dot(d, c) < 0, -1, 1).astype(v.dtype)
+    sign = jnp.where(dot(d, c) < 0, -1, 1).astype(c.dtype)
     offset = d - sign[None] * c
-    gap = 0.5 * _dot(offset, offset)
+    gap = 0.5 * dot(offset, offset)
     u_c = (sign * (1 - gap))[None]
-    project = lambda tau, kappa: _dot(tau[:, :, None], offset[:, None]) - kappa[:, None] * u_c
+    project = lambda tau, kappa: dot(tau[:, :, None], offset[:, None]) - kappa[:, None] * u_c
     y0, y1 = project(arcs.tau, arcs.kappa), project(arcs.tau_next, arcs.kappa_next)
-    u0, u1, rise = u_c + y0, u_c + y1, project(arcs.d_tau, arcs.d_kappa)
+    u0, u1 = u_c + y0, u_c + y1
+    rise = project(arcs.tau_next - arcs.tau, arcs.kappa_next - arcs.kappa)  # u1 - u0
     t, tail, ratio_1 = arcs.t[:, None], arcs.tail[:, None], arcs.ratio_1[:, None]
     inverse_angle, over_sine, over_t = (arcs.inverse(x)[:, None] for x in (arcs.angle, arcs.sine, arcs.t))
     slope, both = rise * inverse_angle, u0 + u1
     end_slope = jnp.where(arcs.short[:, None], rise * over_sine - u1 * t, u1 * over_t - both * over_sine)
-    along = _dot(arcs.normal[:, :, None], d[:, None])
-    total = _dot(arcs.total[:, None], d)
+    along = dot(arcs.normal[:, :, None], d[:, None])
+    total = dot(arcs.total[:, None], d)
     terms = _Zonal(
         u0, u1, y0, y1, slope, end_slope,
         mean_u=both * (0.5 / (1 + tail)),
@@ -263,7 +298,7 @@ def _zonal_terms(v: Loop, axes: Float[Array, "k 3"]) -> tuple[_Zonal, Float[Arra
         along=along,
         of_value=both * (0.5 * tail / (1 + tail)) - 0.5 * (y0 + y1),
         of_derivative=end_slope * (u1 * t - slope * ratio_1) - y1 * (u1 + u_c),
-        sign=sign[None], gap=gap[None], share=total[None] / v.shape[1],
+        sign=sign[None], gap=gap[None], share=total[None] / len(u0),
     )  # fmt: skip
     return _Zonal(*(jnp.broadcast_to(x, u0.shape) for x in terms)), total
 
@@ -290,16 +325,16 @@ class _Boundary(NamedTuple):
         zero, one = jnp.zeros_like(self.u0), jnp.ones_like(self.u0)
         return zero, one, zero, zero, zero, one, zero, zero, 2 * self.weight, zero, zero, zero, zero, zero
 
-    def advance(self, state: tuple, n: tuple) -> tuple[tuple, Array, Array]:
+    def advance(self, state: tuple, n: _Factors) -> tuple[tuple, Array, Array]:
         """From degree l-1 to l: the new state, and the two components of V_l."""
         q0, q, dq0, dq, e0, e, s0, s, middle, chord, z_middle0, z_middle, z_chord0, z_chord = state
-        up, back, _, _, odd, _, scale = n
+        up, back = n.up, n.back
         q_next, dq_next = up * self.u0 * q - back * q0, up * (self.u1 * dq + self.slope * q) - back * dq0
-        s_next = s0 + odd * e
+        s_next = s0 + n.odd * e
         e_next = up * (self.d_middle * middle + self.d_chord * chord) - back * e0
-        z_middle_next, z_chord_next = z_middle0 + odd * middle, z_chord0 + odd * chord
-        middle = scale * (self.d_middle * s_next - z_middle + self.weight * (2 * q_next + self.length * dq_next))
-        chord = scale * (self.d_chord * s_next - z_chord - self.half_cosine * dq_next)
+        z_middle_next, z_chord_next = z_middle0 + n.odd * middle, z_chord0 + n.odd * chord
+        middle = n.next * (self.d_middle * s_next - z_middle + self.weight * (2 * q_next + self.length * dq_next))
+        chord = n.next * (self.d_chord * s_next - z_chord - self.half_cosine * dq_next)
         z = (z_middle, z_middle_next, z_chord, z_chord_next)
         return (q, q_next, dq, dq_next, e, e_next, s, s_next, middle, chord, *z), middle, chord
 
@@ -309,12 +344,11 @@ class _Boundary(NamedTuple):
         return middle - chord, middle + chord
 
 
-def _boundary_terms(v: Loop, axes: Float[Array, "k 3"]) -> _Boundary:
+def _boundary_terms(arcs: _Arcs, axes: Float[Array, "k 3"]) -> _Boundary:
     """The terms [e, k, p]."""
-    arcs = _Arcs(v)
     d = axes.T[:, None, :, None]
-    u0, u1 = _dot(v[:, :, None], d), _dot(jnp.roll(v, -1, 1)[:, :, None], d)
-    rise = _dot((arcs.d_tau - arcs.d_kappa[None] * arcs.c[:, None])[:, :, None], d)
+    u0, u1 = (dot(x[:, :, None], d) for x in (arcs.start, arcs.end))
+    rise = dot((arcs.tau_next - arcs.tau - (arcs.kappa_next - arcs.kappa)[None] * arcs.c[:, None])[:, :, None], d)
     half_sine, half_cosine, angle = arcs.half_sine, arcs.half_cosine[:, None], arcs.angle
     inverse_angle, inverse_half_sine = (arcs.inverse(x)[:, None] for x in (angle, half_sine))
     terms = _Boundary(
@@ -329,11 +363,7 @@ def _boundary_terms(v: Loop, axes: Float[Array, "k 3"]) -> _Boundary:
 
 
 def _edges(terms: _Zonal | _Boundary) -> list:
-    """The terms of each edge as plain vectors over axes and points.
-
-    One kernel then runs over memory in order. With rows numbered through, LLVM cannot tell that arrays do not overlap,
-    and falls back to scalar code; terms that are not kept as arrays would be computed again in it.
-    """
+    """The terms of each edge as plain vectors over axes and points, so that one kernel runs over memory in order."""
     return [type(terms)(*jax.lax.optimization_barrier([x[e].reshape(-1) for x in terms])) for e in range(len(terms.u0))]
 
 
@@ -342,19 +372,16 @@ def _flat(weights: Float[Array, "l k q"], like: Float[Array, "k p"]) -> Float[Ar
 
 
 def _edge_speeds(
-    axes: Array, v: Loop, d_axes: Array | SymbolicZero, dv: Array | SymbolicZero
-) -> tuple[Edges, Edges] | None:
-    """theta n . velocity of both ends of every edge, in the frame that turns with each axis; None if nothing moves."""
-    if isinstance(d_axes, SymbolicZero) and isinstance(dv, SymbolicZero):
-        return None
-    normal = _Arcs(v).normal
-    ends = (v, jnp.roll(v, -1, 1))
-    speeds = [jnp.zeros((v.shape[1], 1, v.shape[2]), v.dtype)] * 2
+    arcs: _Arcs, axes: Float[Array, "k 3"], d_axes: Array | SymbolicZero, dv: Array | SymbolicZero
+) -> tuple[Array, Array]:
+    """theta n . velocity of both ends of every edge [e, k or 1, p], in the frame that turns with each axis."""
+    speeds = [jnp.zeros_like(arcs.angle)[:, None]] * 2
     if not isinstance(dv, SymbolicZero):
-        speeds = [_dot(normal, x)[:, None] for x in (dv, jnp.roll(dv, -1, 1))]
+        speeds = [dot(arcs.normal, x)[:, None] for x in (dv, jnp.roll(dv, -1, 1))]
     if not isinstance(d_axes, SymbolicZero):
         turn = jnp.cross(axes, d_axes).T[:, None, :, None]
-        speeds = [s - _dot(turn, _cross(x, normal)[:, :, None]) for s, x in zip(speeds, ends, strict=True)]
+        ends = (arcs.start, arcs.end)
+        speeds = [s - dot(turn, cross(x, arcs.normal)[:, :, None]) for s, x in zip(speeds, ends, strict=True)]
     return speeds[0], speeds[1]
 
 
@@ -362,29 +389,13 @@ def _sweep(
     step: Callable, state: tuple, degree: int, weights: Float[Array, "l kp"], edge: tuple, first: int = 2
 ) -> tuple:
     """`state` after steps of degree `first` ... `degree`, as straight code or, for high degrees, as a loop."""
-    l = np.arange(first, degree + 1)
-    factors = _factors(l, weights.dtype)
+    factors = _factors(first, degree, weights.dtype)
     if degree > _UNROLLED:
         body = lambda state, x: (step(state, *x, edge), None)
         return jax.lax.scan(body, state, (factors, weights[first:]))[0]
-    for i in range(len(l)):
-        state = step(state, tuple(f[i] for f in factors), weights[l[i]], edge)
+    for l in range(first, degree + 1):
+        state = step(state, _Factors(*(f[l - first] for f in factors)), weights[l], edge)
     return state
-
-
-def _factors(l: np.ndarray, dtype: jnp.dtype) -> tuple[np.ndarray, ...]:
-    """(2l-1)/l, (l-1)/l, ((l-1)/l)^2, (2l-1)/l^2, 2l-1, 1/(l(l+1)), 1/(l+1)."""
-    l = l.astype(float)
-    values = ((2 * l - 1) / l, (l - 1) / l, ((l - 1) / l) ** 2, (2 * l - 1) / l**2, 2 * l - 1, 1 / (l * (l + 1)))
-    return tuple(x.astype(dtype) for x in (*values, 1 / (l + 1)))
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def _sum_all(x: Array) -> Float[Array, " p"]:
@@ -396,10 +407,6 @@ def _sum_all(x: Array) -> Float[Array, " p"]:
 def _sum_edges(x: Array) -> Array:
     """Sum over the first axis, written out for the same reason."""
     return functools.reduce(jnp.add, [x[i] for i in range(x.shape[0])])
-
-
-def _sqrt(x: Array) -> Array:
-    return jnp.where(x == 0, 0, jnp.sqrt(jnp.where(x == 0, 1, x)))
 
 
 def _arctan_tail(t2: Array) -> Array:

@@ -11,9 +11,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import cross, dot, normalize
 from shisd._typing import Array, Float, Scalar
-from shisd.domains._moments import Loop, _cross, _dot
+from shisd.domains._moments import Loop
 
 
 class SphericalPolygon(eqx.Module):
@@ -107,7 +107,7 @@ def clip_to_hemisphere(polygon: SphericalPolygon, normal: ArrayLike) -> Spherica
         raise ValueError(f"`normal` must have shape [3]; got {list(n.shape)}.")
     v = polygon.loop()
     n = normalize(n.astype(v.dtype))
-    clipped = clip(v, _dot(v, n[:, None, None]))
+    clipped = clip(v, dot(v, n[:, None, None]))
     return SphericalPolygon(normalize(clipped[..., 0].T), largest=polygon.largest)
 
 
@@ -123,12 +123,12 @@ def solid_angle(polygon: SphericalPolygon) -> Scalar:
 def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | None = None) -> Float[Array, " p"]:
     """Solid angles of loops. The fan starts at the first vertex, or where another is nearly opposite, at `fallback`."""
     first = jax.lax.stop_gradient(v[:, 0])
-    risky = jnp.min(_dot(v, first[:, None]), axis=0) < -0.9
+    risky = jnp.min(dot(v, first[:, None]), axis=0) < -0.9
     other = _far_from_opposites(jax.lax.stop_gradient(v)) if fallback is None else jax.lax.stop_gradient(fallback)
     apex = jnp.where(risky[None], other, first)[:, None]
     following = jnp.roll(v, -1, axis=1)
-    across = _dot(apex - v, _cross(v, following - v))
-    along = 1 + _dot(apex, v) + _dot(apex, following) + _dot(v, following)
+    across = dot(apex - v, cross(v, following - v))
+    along = 1 + dot(apex, v) + dot(apex, following) + dot(v, following)
     angle = 2 * jnp.sum(jnp.arctan2(across, along), axis=0)
     turns = jnp.floor((largest - angle) / (4 * np.pi))
     return angle + (4 * np.pi) * jax.lax.stop_gradient(turns)
@@ -159,8 +159,8 @@ def clip(points: Loop, height: Float[Array, "s p"]) -> Float[Array, "3 t p"]:
     candidates = jnp.stack([points, crossing], axis=2).reshape(3, 2 * slots, -1)
     place = jnp.cumsum(found, axis=0, dtype=jnp.int32) - 1
     nothing = place[-1] < 0
-    slot = jnp.where(jnp.arange(slots + slots // 2, dtype=jnp.int32)[:, None] > place[-1][None], 0, 1)
-    slot = slot * jnp.arange(slots + slots // 2, dtype=jnp.int32)[:, None]  # slots beyond the last repeat the first
+    slot = jnp.arange(slots + slots // 2, dtype=jnp.int32)[:, None]
+    slot = jnp.where(slot > place[-1][None], 0, slot)  # slots beyond the last repeat the first
     chosen = (place[None] == slot[:, None]) & found[None]  # [t, 2s, p]
     result = jnp.sum(jnp.where(chosen[None], candidates[:, None], 0), axis=2)
     return jnp.where(nothing[None, None], jax.lax.stop_gradient(points[:, :1]), result)

@@ -39,13 +39,11 @@ def multiply(a: ArrayLike, b: ArrayLike, degree: int) -> Float[Array, "*batch n"
     rows, columns = _grid(degree_a + degree_b + kept)
 
     def on_grid(c: Array) -> Array:
-        values = _transform.synthesize(c.astype(dtype).reshape(-1, c.shape[-1]), "gauss", rows, columns)
+        values = _transform.synthesize(c.astype(dtype), "gauss", rows, columns)
         return values.reshape(rows, columns, *[1] * (len(shape) + 1 - c.ndim), *c.shape[:-1])
 
-    values = on_grid(a) * on_grid(b)
-    product = _transform.analyse(values.reshape(rows, columns, -1), "gauss", kept)
-    product = jnp.pad(product, ((0, 0), (0, (degree + 1) ** 2 - (kept + 1) ** 2)))
-    return product.reshape(*shape, (degree + 1) ** 2)
+    product = _transform.analyse(on_grid(a) * on_grid(b), "gauss", kept)
+    return jnp.pad(product, (*((0, 0),) * len(shape), (0, (degree + 1) ** 2 - (kept + 1) ** 2)))
 
 
 def product_matrix(coefficients: ArrayLike, degree: int) -> Float[Array, "n n"]:
@@ -65,7 +63,7 @@ def product_matrix(coefficients: ArrayLike, degree: int) -> Float[Array, "n n"]:
         raise ValueError(f"`coefficients` must be one expansion; got {list(c.shape)}. Batch it with jax.vmap.")
     kept = min(degree_g, 2 * degree)
     rows, columns = _grid(kept + 2 * degree)
-    g = _transform.synthesize(c[None, : (kept + 1) ** 2], "gauss", rows, columns)[..., 0]
+    g = _transform.synthesize(c[: (kept + 1) ** 2], "gauss", rows, columns)
     azimuth, polar, padded = (jnp.asarray(table, c.dtype) for table in _matrix_tables(degree, rows, columns))
     return _product_matrix(g, azimuth, polar, padded, degree)
 

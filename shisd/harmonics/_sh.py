@@ -117,8 +117,7 @@ def _basis_jvp(degree, primals, tangents):
     dy = jnp.zeros_like(flat)
     for rate, terms in zip(du.reshape(-1, 3).T, _tables.gradient_gather(degree, transpose=False), strict=True):
         slope = sum(jnp.asarray(factor[None], y.dtype) * flat[:, index] for index, factor in terms)
-        if terms:
-            dy += (rate[:, None] @ ones) * slope
+        dy += (rate[:, None] @ ones) * slope
     return y, dy.reshape(y.shape)
 
 

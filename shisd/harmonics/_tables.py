@@ -42,6 +42,15 @@ def associated_legendre(theta: np.ndarray, degree: int) -> np.ndarray:
     return p
 
 
+def basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """y_l^m at unit vectors [N, 3], as [N, (L+1)^2], float64 on the host."""
+    x, y, z = directions.T
+    m, l = orders(degree), bands(degree)
+    p = associated_legendre(np.arctan2(np.hypot(x, y), z), degree)[l, np.abs(m)].T
+    angle = np.outer(np.arctan2(y, x), np.abs(m))
+    return p * np.where(m == 0, 1, np.sqrt(2) * np.where(m > 0, np.cos(angle), np.sin(angle)))
+
+
 @functools.cache
 def zonal_norms(degree: int) -> np.ndarray:
     """sqrt((2l + 1) / 4 pi), the value of y_l^0 at its pole."""

@@ -3,8 +3,8 @@
 Follows the separation of variables of every fast transform: Fourier series along each row, then one sum over the rows
 for each order m. The second step differs: rows are first reduced to their Fourier series in the polar angle, one matrix
 product, since the normalised associated Legendre functions are short series there too (`_tables.polar_series`). The
-tables then no longer grow with the number of rows, and the product is not bound by memory: on 512 x 1024 texels 1.5
-times as fast as sums with the Legendre functions of each row at degree 64, and 4 times at degree 128.
+tables then no longer grow with the number of rows, and the product is not bound by memory as sums with the Legendre
+functions of each row are.
 
 Rows are symmetric about the equator, and so is each function, with the sign (-1)^(l+m): sums and differences of
 mirrored rows halve the work again.
@@ -121,7 +121,7 @@ def _analyse(values: Array, azimuth: Array, polar: Array, series: Array, degree:
         bins = jnp.pad(bins, ((0, 0), (0, 0), (0, azimuth.size - bins.shape[-1]))) * azimuth.reshape(1, 1, -1)
         orders = jnp.stack([bins.real, -bins.imag], axis=-1)
     else:
-        # As a plain matrix product: the same sum as an einsum is three times slower.
+        # As a plain matrix product: the same sum as an einsum is slower.
         orders = values.reshape(-1, values.shape[-1]) @ azimuth.reshape(values.shape[-1], -1)
         orders = orders.reshape(-1, rows, *azimuth.shape[1:])
     north, south = orders[:, :half], orders[:, rows - half :][:, ::-1]

@@ -204,7 +204,7 @@ def _lowest_direction(c: Float[Array, " n"], degree: int) -> Float[Array, "3"]:
 
 def _on_grid(c: Float[Array, " n"], degree: int) -> Float[Array, "h w"]:
     height = 4 * (degree + 1)
-    return _transform.synthesize(c[None], "fejer", height, 2 * height)[..., 0]
+    return _transform.synthesize(c, "fejer", height, 2 * height)
 
 
 def _tangents(u: Float[Array, "3"]) -> Float[Array, "2 3"]:

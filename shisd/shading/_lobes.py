@@ -197,13 +197,13 @@ def _hemisphere_modes(degree: int) -> tuple[np.ndarray, np.ndarray]:
     The eigenvectors of the matrix H of integrals of y_i y_j above the horizon, one block for every order m. With b the
     projection of a function that vanishes below, the least squares fit above, regularised, is (H + ridge)^-1 b.
     """
-    z, weight = np.polynomial.legendre.leggauss(degree + 1)
-    p = _tables.associated_legendre(np.arccos((z + 1) / 2), degree)  # exact: z alone is even or odd in each product
+    z, weight = _unit_gauss(degree + 1)
+    p = _tables.associated_legendre(np.arccos(z), degree)  # a product of two of one order is a polynomial of z
     modes, shares = np.zeros(((degree + 1) ** 2,) * 2), np.zeros((degree + 1) ** 2)
     for m in range(-degree, degree + 1):
         l = np.arange(abs(m), degree + 1)
         rows = p[l, abs(m)]
-        values, vectors = np.linalg.eigh(np.pi * (rows * weight) @ rows.T)
+        values, vectors = np.linalg.eigh(2 * np.pi * (rows * weight) @ rows.T)
         modes[np.ix_(l * l + l + m, l * l + l + m)] = vectors
         shares[l * l + l + m] = np.maximum(values, 0)
     return modes, shares

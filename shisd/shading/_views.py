@@ -14,7 +14,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 
-from shisd._numerics import angle_multiples
+from shisd._numerics import angle_multiples, safe_sqrt
 from shisd._typing import Array, Float
 
 
@@ -73,6 +73,4 @@ def azimuth_factors(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array,
 
 
 def _sine(view: Float[Array, "p 3"]) -> Float[Array, " p"]:
-    square = view[:, 0] ** 2 + view[:, 1] ** 2
-    off = square > 0
-    return jnp.where(off, jnp.sqrt(jnp.where(off, square, 1)), 0)
+    return safe_sqrt(view[:, 0] ** 2 + view[:, 1] ** 2)

@@ -212,7 +212,7 @@ def bench_polygons(degrees=(8, 20)):
         w = rng.normal(size=(degree + 1, len(axes))).astype(np.float32)
         w[0] = 0
         fold = lambda v, axes=axes, w=w, degree=degree: jax.lax.map(
-            lambda tile: _moments.fold(jnp.asarray(w)[..., None], jnp.asarray(axes), tile, degree), v
+            jax.checkpoint(lambda tile: _moments.fold(jnp.asarray(w)[..., None], jnp.asarray(axes), tile, degree)), v
         ).reshape(-1)
         ours = jax.jit(fold)
         gradient = jax.jit(jax.value_and_grad(lambda v, fold=fold: jnp.sum(fold(v))))
