@@ -4,6 +4,7 @@ A polygon is positive when counter-clockwise seen from outside the sphere, the i
 reversed winding changes the sign of every integral. Integrals are in sr times the unit of the integrand.
 """
 
+from shisd.domains._haar import HaarBasis as HaarBasis
 from shisd.domains._integrate import axial_moments as axial_moments
 from shisd.domains._integrate import integrate as integrate
 from shisd.domains._integrate import polygon_coefficients as polygon_coefficients

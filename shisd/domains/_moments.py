@@ -108,7 +108,7 @@ def moments(axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, "l 
 
     def step(state: tuple, n: _Factors) -> tuple[tuple, Array]:
         state, change = terms.advance(state, n)
-        return state, n.laplacian * _sum_edges(change)
+        return state, _sum_edges(change) * n.laplacian
 
     _, rest = jax.lax.scan(step, terms.start(), _factors(2, degree, v.dtype))
     return jnp.concatenate([first[None], rest])

@@ -46,47 +46,57 @@ def multiply(a: ArrayLike, b: ArrayLike, degree: int) -> Float[Array, "*batch n"
     return jnp.pad(product, (*((0, 0),) * len(shape), (0, (degree + 1) ** 2 - (kept + 1) ** 2)))
 
 
-def product_matrix(coefficients: ArrayLike, degree: int) -> Float[Array, "n n"]:
-    """The matrix of f -> (g f), from coefficients of f up to `degree` to those of the product up to `degree`.
+def product_matrix(
+    coefficients: ArrayLike, degree: int, *, input_degree: int | None = None
+) -> Float[Array, "n_out n_in"]:
+    """The matrix of f -> (g f), from coefficients of f up to `input_degree` to those of the product up to `degree`.
 
-    matrix[i, j] = integral over the sphere of y_i g y_j, the triple product of ISD15; symmetric and exact.
+    matrix[i, j] = integral over the sphere of y_i g y_j, the triple product of ISD15; exact. With `input_degree` Li,
+    `degree` unless given, it is symmetric; with degree = Lg + Li nothing of the product is lost.
 
-    Arguments: `coefficients` of g [(Lg+1)^2], of any degree (bands above 2 `degree` have no effect); static `degree` L.
-    Returns [(L+1)^2, (L+1)^2].
+    Arguments: `coefficients` of g [(Lg+1)^2], of any degree (bands above L + Li have no effect); static `degree` L.
+    Returns [(L+1)^2, (Li+1)^2].
     Derivatives: linear in `coefficients`.
-    Cost: (L+1)^4 times the number of rows, (Lg + 2 L) / 2 + 1; the integral over azimuth is done once for each row and
-    pair of orders.
+    Cost: (L+1)^2 (Li+1)^2 times the number of rows, (Lg + L + Li) / 2 + 1; the integral over azimuth is done once for
+    each row and pair of orders.
     """
     c, degree_g = _checks.coefficients("coefficients", coefficients)
     degree = _checks.degree(degree)
+    inputs = degree if input_degree is None else _checks.integer("input_degree", input_degree)
     if c.ndim != 1:
         raise ValueError(f"`coefficients` must be one expansion; got {list(c.shape)}. Batch it with jax.vmap.")
-    kept = min(degree_g, 2 * degree)
-    rows, columns = _grid(kept + 2 * degree)
+    kept = min(degree_g, degree + inputs)
+    rows, columns = _grid(kept + degree + inputs)
     g = _transform.synthesize(c[: (kept + 1) ** 2], "gauss", rows, columns)
-    azimuth, polar, padded = (jnp.asarray(table, c.dtype) for table in _matrix_tables(degree, rows, columns))
-    return _product_matrix(g, azimuth, polar, padded, degree)
+    tables = (jnp.asarray(table, c.dtype) for table in _matrix_tables(degree, inputs, rows, columns))
+    matrix = _product_matrix(g, *tables, degree, inputs)
+    return matrix if inputs != degree else (matrix + matrix.T) / 2
 
 
-@functools.partial(jax.jit, static_argnums=4)
-def _product_matrix(g: Array, azimuth: Array, polar: Array, padded: Array, degree: int) -> Float[Array, "n n"]:
-    band, order = _index(_tables.bands(degree)), _index(_tables.orders(degree) + degree)
-    pairs = jnp.einsum("jc,cm,cn->jmn", g, azimuth, azimuth)  # integral of T_m g T_m' along row j
-    columns = pairs[:, :, order] * polar.T[:, None, :]  # [row, m, column of the matrix]
-    matrix = jnp.einsum("mlj,jmn->mln", padded, columns)[order, band]
-    return (matrix + matrix.T) / 2
+@functools.partial(jax.jit, static_argnums=(5, 6))
+def _product_matrix(
+    g: Array, azimuth: Array, polar: Array, azimuth_in: Array, polar_in: Array, degree: int, inputs: int
+) -> Float[Array, "n_out n_in"]:
+    pairs = jnp.einsum("jc,cm,cn->jmn", g, azimuth, azimuth_in)  # integral of T_m g T_m' along row j
+    columns = pairs[:, :, _index(_tables.orders(inputs) + inputs)] * polar_in.T[:, None, :]  # [row, m, column]
+    matrix = jnp.einsum("mlj,jmn->mln", polar, columns)
+    return matrix[_index(_tables.orders(degree) + degree), _index(_tables.bands(degree))]
 
 
 @functools.cache
-def _matrix_tables(degree: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T_m at the columns [c, m]; p_lm at the rows, by index [n, j]; the same, times texel areas, by order [m, l, j]."""
+def _matrix_tables(degree: int, inputs: int, rows: int, columns: int) -> tuple[np.ndarray, ...]:
+    """T_m at the columns [c, m] and p_lm at the rows, times texel areas, by order [m, l, j]; of the input by [n, j]."""
     theta, weights = _quadrature.gauss_rows(rows)
-    m = np.arange(-degree, degree + 1)
-    m_phi = np.outer(_quadrature.azimuths(columns), np.abs(m))
-    azimuth = np.where(m < 0, np.sin(m_phi), np.cos(m_phi)) * np.where(m == 0, 1, np.sqrt(2))
-    p = _tables.associated_legendre(theta, degree)
-    padded = p[:, np.abs(m)].transpose(1, 0, 2) * weights * (2 * np.pi / columns)
-    return azimuth, p[_tables.bands(degree), np.abs(_tables.orders(degree))], padded
+
+    def azimuth(degree: int) -> np.ndarray:
+        m = np.arange(-degree, degree + 1)
+        m_phi = np.outer(_quadrature.azimuths(columns), np.abs(m))
+        return np.where(m < 0, np.sin(m_phi), np.cos(m_phi)) * np.where(m == 0, 1, np.sqrt(2))
+
+    p = _tables.associated_legendre(theta, max(degree, inputs))
+    areas = weights * (2 * np.pi / columns)
+    polar = p[: degree + 1, np.abs(np.arange(-degree, degree + 1))].transpose(1, 0, 2) * areas
+    return azimuth(degree), polar, azimuth(inputs), p[_tables.bands(inputs), np.abs(_tables.orders(inputs))]
 
 
 def _index(table: np.ndarray) -> np.ndarray:

@@ -51,9 +51,9 @@ def _rotate(c: Float[Array, "*batch n"], r: Float[Array, "3 3"], degree: int) ->
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def rotate_many(
-    c: Float[Array, "f n"], r: Float[Array, "p 3 3"], degree: int, upright: bool = False
+    c: Float[Array, "f n"] | Float[Array, "n f p"], r: Float[Array, "p 3 3"], degree: int, upright: bool = False
 ) -> Float[Array, "n f p"]:
-    """Every expansion rotated by every matrix, without a check. Rotations stand last: they are the vector lanes.
+    """Expansions rotated by every matrix, or each by its own, unchecked. Rotations stand last: they are vector lanes.
 
     `upright` promises that R z has y = 0 <= x, so that a = 0 and the last turn is left out.
     """
@@ -79,7 +79,7 @@ def _rotate_many_jvp(degree, upright, primals, tangents):
 rotate_many.defjvp(_rotate_many_jvp, symbolic_zeros=True)
 
 
-def _rotate_many_away_from_pole(c: Float[Array, "f n"], r: Float[Array, "p 3 3"], degree: int) -> Array:
+def _rotate_many_away_from_pole(c: Array, r: Float[Array, "p 3 3"], degree: int) -> Array:
     """`rotate_many` with smooth angles: linear in c, so its transpose is differentiated as it stands.
 
     Where R nearly keeps the z axis, R = (R Q^T) Q with the quarter turn Q about x; R Q^T takes z far from z.
@@ -87,8 +87,10 @@ def _rotate_many_away_from_pole(c: Float[Array, "f n"], r: Float[Array, "p 3 3"]
     quarter = jnp.asarray([[1, 0, 0], [0, 0, -1], [0, 1, 0]], r.dtype)
     near = r[:, 2, 2] ** 2 > 0.5
     a, b, (cos_g, sin_g) = _turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
-    flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[None], c.dtype)
-    quartered = _swap(c.T[..., None], degree)[..., 0].T * flip
+    flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[:, None, None], c.dtype)
+    shared = c.ndim == 2
+    quartered = _swap(c.T[..., None] if shared else c, degree) * flip
+    quartered = quartered[..., 0].T if shared else quartered
     turned = (_swap_turned(x, cos_g, sin_g, degree) for x in (quartered, c))
     x = jnp.where(near[None, None], *turned)
     return _finish(x, a, b, degree)
@@ -132,8 +134,10 @@ def _swap(x: Float[Array, "n f p"], degree: int) -> Float[Array, "n f p"]:
     return jnp.concatenate(bands)
 
 
-def _swap_turned(c: Float[Array, "f n"], cos: Array, sin: Array, degree: int) -> Float[Array, "n f p"]:
-    """`_swap` of `_turn` of coefficients that all rotations share: one product with the cosines and sines."""
+def _swap_turned(c: Array, cos: Array, sin: Array, degree: int) -> Float[Array, "n f p"]:
+    """`_swap` of `_turn`; of coefficients [f, n] that all rotations share, one product with the cosines and sines."""
+    if c.ndim == 3:
+        return _swap(_turn(c, cos, sin, degree), degree)
     cosine, sine = [], []
     for l, j in enumerate(_tables.swap_matrices(degree)):
         plus, minus = c[None, :, l * l + l : (l + 1) ** 2], c[None, :, l * l : l * l + l + 1][..., ::-1]

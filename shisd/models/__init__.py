@@ -11,6 +11,7 @@ from shisd.models._brdf import Lambertian as Lambertian
 from shisd.models._brdf import Phong as Phong
 from shisd.models._environment import Environment as Environment
 from shisd.models._light import PolygonLight as PolygonLight
+from shisd.models._light import PortalLight as PortalLight
 from shisd.models._measured import MeasuredBrdf as MeasuredBrdf
 from shisd.models._microfacet_fits import AbcMicrofacet as AbcMicrofacet
 from shisd.models._microfacet_fits import SgdMicrofacet as SgdMicrofacet

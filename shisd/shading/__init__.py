@@ -6,4 +6,6 @@ Directions are in world space and point away from the surface; image colour is t
 from shisd.shading._environment import shade_environment as shade_environment
 from shisd.shading._lobes import Lobes as Lobes
 from shisd.shading._lobes import tabulate_brdf as tabulate_brdf
+from shisd.shading._polygon import project_light as project_light
 from shisd.shading._polygon import shade_polygon as shade_polygon
+from shisd.shading._polygon import shade_portal as shade_portal

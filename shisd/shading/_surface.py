@@ -56,16 +56,9 @@ def shade_tiles(
     """`radiance(frame, slices, **others)` of all points, `size` at a time; 0 where the view is below the horizon.
 
     `frame` [p, 3, 3] is local to world, `slices` [*colour, n, p] are the material's coefficients in it, and `others`
-    the `points` of the tile that are not directions. The backward pass makes each tile again.
+    the `points` of the tile that are not directions.
     """
-    count = points["normals"].shape[0]
-    if count == 0:
-        return jnp.zeros((0, *colour), table.dtype)
-    size = min(count, size)
-    tiles = -(-count // size)
-    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
 
-    @jax.checkpoint
     def shade_tile(tile: dict[str, Array]) -> Float[Array, " p *colour"]:
         directions = {name: normalize(a) for name, a in tile.items() if name in _DIRECTIONS}
         others = {name: a for name, a in tile.items() if name not in _DIRECTIONS}
@@ -75,8 +68,20 @@ def shade_tiles(
         values = radiance(r, slice_values(table, local, lobes), **others)
         return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(values, -1, 0))
 
-    values = jax.lax.map(shade_tile, {name: fill(a) for name, a in points.items()})
-    return values.reshape(tiles * size, *colour)[:count]
+    return in_tiles(shade_tile, points, size)
+
+
+def in_tiles(function: Callable[[dict[str, Array]], Array], rows: dict[str, Float[Array, "p 3"]], size: int) -> Array:
+    """function(rows) for `size` rows at a time, the last tile filled up; the backward pass makes each tile again."""
+    count = len(next(iter(rows.values())))
+    if count == 0:
+        one = jax.eval_shape(function, {name: jax.ShapeDtypeStruct((1, 3), a.dtype) for name, a in rows.items()})
+        return jnp.zeros((0, *one.shape[1:]), one.dtype)
+    size = min(count, size)
+    tiles = -(-count // size)
+    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
+    values = jax.lax.map(jax.checkpoint(function), {name: fill(a) for name, a in rows.items()})
+    return values.reshape(tiles * size, *values.shape[2:])[:count]
 
 
 @jax.custom_jvp

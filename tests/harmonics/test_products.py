@@ -67,6 +67,14 @@ def test_matrix_is_symmetric_and_multiplies(dtype, rng, g, degree):
     np.testing.assert_allclose(matrix @ f, harmonics.multiply(c, f, degree), atol=TOLERANCE[dtype.name] * size)
 
 
+def test_matrix_between_degrees_loses_nothing(dtype, rng):
+    c, f = (jnp.asarray(rng.normal(size=n), dtype) for n in (16, 9))
+    matrix = harmonics.product_matrix(c, 5, input_degree=2)
+    assert matrix.shape == (36, 9)
+    size = float(jnp.linalg.norm(c) * jnp.linalg.norm(f))
+    np.testing.assert_allclose(matrix @ f, harmonics.multiply(c, f, 5), atol=TOLERANCE[dtype.name] * size)
+
+
 def test_matrix_of_one_is_the_identity(dtype):
     one = jnp.asarray([np.sqrt(4 * np.pi)], dtype)
     np.testing.assert_allclose(harmonics.product_matrix(one, 6), np.eye(49), atol=5 * TOLERANCE[dtype.name])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from shisd import decomposition, models, shading
+from shisd import decomposition, domains, models, shading
 from tests import truth
 from tests.hard_cases import unit
 
@@ -39,12 +39,12 @@ def local_outline(points, position, normal):
 
 
 def quadrature(integrand, points, position, normal, nodes=40):
-    """Integral of integrand(directions in the local frame, frame) over the light, unsigned."""
+    """Integral of integrand(directions in the local frame, frame) over the light, whatever its winding."""
     outline, frame = local_outline(points, position, normal)
     if outline is None:
         return 0.0
     w, area = truth.triangle_rule(outline, nodes)
-    return abs(float(np.sum(integrand(w.astype(float), frame) * area.astype(float))))
+    return np.sign(float(area.sum())) * area.astype(float) @ integrand(w.astype(float), frame)
 
 
 @functools.cache
@@ -91,6 +91,75 @@ def test_exact_for_the_tabulated_slice(dtype, rng):
     np.testing.assert_allclose(got, expected, atol=tolerance * np.max(expected))
 
 
+def expected_radiance(lobes, light, position, normal, view):
+    """The clipped integral of the interpolated slice times light(world directions) [N, colour], SciPy's harmonics."""
+    radiance = []
+    for p, n, v in zip(position, normal, view, strict=True):
+        _, frame = local_outline(QUAD, p, n)
+        c = np.asarray(lobes.slice_coefficients(jnp.asarray(frame @ v, lobes.weights.dtype)), float)
+        values = lambda w, frame, c=c: (truth.scipy_basis(w, 4) @ c)[:, None] * light(w @ frame)
+        radiance.append(quadrature(values, QUAD, p, n) * np.ones(3))
+    return np.stack(radiance)
+
+
+def test_light_by_direction(dtype, rng):
+    """A profile at the light, and distant light through the same outline; in front, and from behind nothing."""
+    position, normal, view = scene(rng, 6)
+    lobes, e = lobes_of("glossy", 4, dtype.name), rng.normal(size=(3, 16)).astype(dtype)
+    tolerance = {"float64": 1e-12, "float32": 3e-5}[dtype.name]
+    points, arrays = QUAD.astype(dtype), [a.astype(dtype) for a in (position, normal, view)]
+    portal = models.PortalLight(points, e, 5)
+    distant = lambda w: truth.scipy_basis(w, 3) @ e.astype(float).T
+    leaving = lambda w: 0.7 * distant(-w)
+    light = models.PolygonLight(points, np.asarray(0.7, dtype), profile=e)
+    for got, radiance in (
+        (shading.shade_portal(lobes, portal, *arrays), distant),
+        (shading.shade_polygon(lobes, light, *arrays), leaving),
+    ):
+        expected = expected_radiance(lobes, radiance, position, normal, view)
+        assert got.dtype == dtype
+        np.testing.assert_allclose(got, expected, atol=tolerance * np.max(np.abs(expected)))
+    outside = models.PortalLight(points[::-1].copy(), e, 4)
+    np.testing.assert_array_equal(shading.shade_portal(lobes, outside, *arrays), 0)
+
+
+def test_a_uniform_profile_and_several_portals(rng):
+    position, normal, view = (a.astype(np.float32) for a in scene(rng, 5))
+    lobes, quad = lobes_of("glossy", 4, "float32"), QUAD.astype(np.float32)
+    one = np.asarray([np.sqrt(4 * np.pi)], np.float32)
+    plain = np.asarray(shading.shade_polygon(lobes, models.PolygonLight(quad), position, normal, view))
+    shaped = models.PolygonLight(quad, np.asarray([1, 2], np.float32), profile=one)
+    got = shading.shade_polygon(lobes, [shaped, models.PolygonLight(quad)], position, normal, view)
+    np.testing.assert_allclose(got, plain[:, None] * [2, 3], rtol=1e-4, atol=1e-6)
+    portal = models.PortalLight(quad, one, 4)
+    got = shading.shade_portal(lobes, [portal, portal], position, normal, view)
+    np.testing.assert_allclose(got, 2 * plain, rtol=1e-4, atol=1e-6)
+
+
+def test_projected_light(dtype, rng):
+    """Coefficients of what a light sends to a point, against quadrature; several points and colours."""
+    position = scene(rng, 4)[0].astype(dtype)
+    e, quad = rng.normal(size=(3, 9)).astype(dtype), QUAD.astype(dtype)
+    lights = {
+        "plain": (models.PolygonLight(quad, np.asarray([1, 2], dtype)), lambda w: np.broadcast_to([1, 2], (len(w), 2))),
+        "portal": (models.PortalLight(quad, e, 5), lambda w: truth.scipy_basis(w, 2) @ e.astype(float).T),
+    }
+    haar = domains.HaarBasis(1)
+    for light, radiance in lights.values():
+        got, cells = (np.asarray(shading.project_light(light, position, basis)) for basis in (5, haar))
+        assert got.dtype == cells.dtype == dtype
+        for p, c, h in zip(position, got, cells, strict=True):
+            w, area = (x.astype(float) for x in truth.triangle_rule(unit(QUAD - p), 40))
+            expected = -(radiance(w) * area[:, None]).T @ truth.scipy_basis(w, 5)
+            np.testing.assert_allclose(c, expected, atol={"float64": 1e-11, "float32": 1e-4}[dtype.name])
+            # the wavelets' integral, and in SciPy's basis what is left of it within each octant
+            total = np.asarray(haar.values(h)) @ haar.areas
+            scale = np.sqrt(4 * np.pi)
+            np.testing.assert_allclose(
+                total, expected[:, 0] * scale, atol={"float64": 1e-11, "float32": 1e-4}[dtype.name]
+            )
+
+
 def test_sides_colours_and_several_lights(rng):
     position, normal, view = (a.astype(np.float32) for a in scene(rng, 5))
     lobes = lobes_of("glossy", 4, "float32")
@@ -117,9 +186,19 @@ def test_derivatives(x64, rng):
         return shading.shade_polygon(lobes, light, position, normal, view)
 
     arguments = (QUAD, np.asarray(1.3), position[1:], normal[1:], view[1:])
-    check_grads(radiance, arguments, order=1, rtol=1e-5, atol=1e-7)
+    check_grads(radiance, arguments, order=1, rtol=1e-6, atol=1e-8)
     below = lambda points: jnp.sum(radiance(points, 1.0, position[:1], normal[:1], view[:1]))
     np.testing.assert_array_equal(jax.grad(below)(jnp.asarray(QUAD)), 0)
+
+
+@pytest.mark.slow
+def test_derivatives_of_portals(x64, rng):
+    position, normal, view = (a[1:4] for a in scene(rng, 4))
+    lobes = lobes_of("glossy", 4, "float64")
+    shade = lambda points, e, *surface: shading.shade_portal(lobes, models.PortalLight(points, e, 4), *surface)
+    check_grads(shade, (QUAD, rng.normal(size=9), position, normal, view), order=1, rtol=1e-6, atol=1e-8)
+    project = lambda points, p: shading.project_light(models.PolygonLight(points), p, domains.HaarBasis(1))
+    check_grads(project, (QUAD, position), order=1, rtol=1e-6, atol=1e-8, eps=1e-5)
 
 
 def test_a_point_in_the_plane_of_the_light_is_dark():
@@ -140,5 +219,13 @@ def test_bad_input_is_named(as_user):
         models.PolygonLight(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="`emission` must be"):
         models.PolygonLight(QUAD, np.ones((2, 3)))
+    with pytest.raises(ValueError, match="`light` must be"):
+        shading.project_light(QUAD, up, 2)
+    with pytest.raises(ValueError, match="`portal` must be a models.PortalLight"):
+        shading.shade_portal(lobes, models.PolygonLight(QUAD), up, up, up)
+    with pytest.raises(ValueError, match="pass PortalLight"):
+        shading.shade_portal(lobes, models.PortalLight(QUAD, np.ones(4), 3), up, up, up)
+    with pytest.raises(ValueError, match="do not broadcast"):
+        models.PolygonLight(QUAD, np.ones(2), profile=np.ones((3, 4)))
     with pytest.raises(ValueError, match="`domain` must be"):
         shading.tabulate_brdf(models.Lambertian(0.5), lobes.basis, domain="lower")
