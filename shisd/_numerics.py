@@ -39,12 +39,15 @@ def _chain(cos: Array, sin: Array, count: int) -> tuple[list[Array], list[Array]
     return c[:count], s[:count]
 
 
-def dot(a: Array, b: Array) -> Array:
+Vector = Array | tuple[Array, Array, Array]  # components on the first axis
+
+
+def dot(a: Vector, b: Vector) -> Array:
     """Scalar products of vectors whose components are on the first axis."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Array, b: Array) -> Array:
+def cross(a: Vector, b: Vector) -> Array:
     """Vector products, components on the first axis."""
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 

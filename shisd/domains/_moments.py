@@ -22,14 +22,16 @@ leading parts cancel by hand. One formula thus serves every size, in both precis
 The derivative of an integral is an integral along the moving edges. It has a recurrence of its own and is exact where
 vertices coincide.
 
-layout: polygons are v[x y z, vertex, p], points p last as vector lanes; axes d[k, x y z]; edges [e, k, p].
+layout: polygons are v[x y z, vertex, p], points p last as vector lanes; axes d[k, x y z]. What belongs to edges is
+[e, p] or [x y z, e, p]; to one edge [p] or [x y z, p], or, for all axes at once, [1, p] or [x y z, 1, p].
 notation: alpha = a - c = tau - kappa c with tau at right angles to c; t = tan(theta/2); q, dq = P_l(u) at a and the
 difference quotient (P_l(u1) - P_l(u0)) / theta; a letter with `_c` belongs to the reference.
 """
 
 import functools
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -40,92 +42,162 @@ from shisd._numerics import cross, dot, safe_sqrt
 from shisd._typing import Array, Float
 
 Loop = Float[Array, "3 s p"]
+Edges = TypeVar("Edges", "_Edges", "_Spans")
+Value = TypeVar("Value")
 
-_UNROLLED = 32  # up to this degree a sweep is one straight line of code, which XLA keeps in registers
+_OPERATIONS = 1600  # in one kernel: XLA cuts longer ones up, which makes them scalar code
+
+
+def fold(weights: Float[Array, "k l q"], axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, " p"]:
+    """sum over k and l >= 1 of weights[k, l] I_l(axes[k]) for every polygon. Weights may be shared (q = 1)."""
+    if degree == 0:
+        return jnp.zeros(v.shape[2:], v.dtype)
+    if _edges_at_once(degree) > 0:
+        return _fold(weights, axes, v, degree)
+    return _sum_all(moments(axes, v, degree) * jnp.swapaxes(weights, 0, 1)[1:])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def fold(weights: Float[Array, "l k q"], axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, " p"]:
-    """sum over l >= 1 and k of weights[l, k] I_l(axes[k]) for every polygon. Weights may be shared (q = 1)."""
-    if degree == 0:
-        return jnp.zeros(v.shape[2:], v.dtype)
-    terms, total = _zonal_terms(_arcs(v), axes)
-    value = _sum_all(0.5 * weights[1] * total)
-    if degree == 1:
-        return value
-    flat = _flat(weights, total)
+def _fold(weights: Array, axes: Array, v: Loop, degree: int) -> Float[Array, " p"]:
+    """Axes in turn; for each, edges and degrees are straight code over plain vectors of points.
 
-    def step(state: tuple, n: _Factors, w: Array, edge: _Zonal) -> tuple:
-        *rest, value = state
-        following, change = edge.advance(tuple(rest), n)
-        return *following, value + (n.laplacian * w) * change
+    That becomes one kernel in vector registers. Arrays over axes and points, or more than a few operands, would make it
+    scalar code, since LLVM could not tell that they do not overlap.
+    """
+    groups = math.ceil(v.shape[1] / _edges_at_once(degree))
+    spare = jnp.broadcast_to(v[:, -1:], (3, -v.shape[1] % groups, v.shape[2]))  # edges of no length fill up the last
+    arcs = _arcs(jnp.concatenate([v, spare], axis=1))
+    share = arcs.total / groups
+    factors = _factors(2, degree, v.dtype)
 
-    for edge in _edges(terms):
-        *_, part = _sweep(step, (*edge.start(), jnp.zeros_like(edge.u0)), degree, flat, edge)
-        value += _sum_all(part.reshape(total.shape))
-    return value
+    def group(value: Array, edges: Float[Array, "rows e p"]) -> tuple[Array, None]:
+        def axis(value: Array, d: Array, w: Array) -> Array:
+            c = _reference(arcs.c, d)
+            terms = _zonal_terms([_unpack(_Edges, edges[:, e]) for e in range(edges.shape[1])], d, c)
+            point, states = c.start(), [t.start() for t in terms]
+            sums, sum_c = [jnp.zeros_like(c.gap) for _ in terms], 0.5 * w[1]
+            for l in range(2, degree + 1):
+                n = _Factors(*(f[l - 2] for f in factors))
+                states = [t.advance(s, point, n) for t, s in zip(terms, states, strict=True)]
+                point = c.advance(point, n)
+                w_l = n.laplacian * w[l]
+                sums = [x + w_l * s.s for x, s in zip(sums, states, strict=True)]
+                sum_c += w_l * point.r
+            change = dot(share, d) * sum_c + sum(t.along * x for t, x in zip(terms, sums, strict=True))
+            return value + change
+
+        return _for_axes(axis, value, axes, weights), None
+
+    value = jnp.zeros_like(arcs.total[0])
+    if groups == 1:
+        return group(value, arcs.edges)[0]
+    parts = arcs.edges.reshape(arcs.edges.shape[0], groups, -1, v.shape[2])
+    return jax.lax.scan(group, value, jnp.moveaxis(parts, 1, 0))[0]
+
+
+def _edges_at_once(degree: int) -> int:
+    return (_OPERATIONS // degree - 8) // 18  # a step takes 18 operations for each edge, and 8 for all
 
 
 def _fold_jvp(degree, primals, tangents):
     (weights, axes, v), (d_weights, d_axes, dv) = primals, tangents
-    value = fold(weights, axes, v, degree)
+    value = _fold(weights, axes, v, degree)
     change = jnp.zeros_like(value)
-    if degree == 0:
-        return value, change
     if not isinstance(d_weights, SymbolicZero):
-        change += _sum_all(moments(axes, v, degree) * d_weights[1:])
-    if not (isinstance(d_axes, SymbolicZero) and isinstance(dv, SymbolicZero)):
-        arcs = _arcs(v)
-        terms, speeds = _boundary_terms(arcs, axes), _edge_speeds(arcs, axes, d_axes, dv)
-
-        def step(state: tuple, n: _Factors, w: Array, edge: _Boundary) -> tuple:
-            *rest, middle, chord = state
-            following, middle_l, chord_l = edge.advance(tuple(rest), n)
-            return *following, middle + w * middle_l, chord + w * chord_l
-
-        shape = terms.u0.shape[1:]
-        flat = _flat(weights, terms.u0[0])
-        for e, edge in enumerate(_edges(terms)):
-            zero = jnp.zeros_like(edge.u0)
-            *_, middle, chord = _sweep(step, (*edge.start(), zero, zero), degree, flat, edge, first=1)
-            # Reshaped, a result cannot take the place of one of the terms in memory, for which see `_edges`.
-            middle, chord = jax.lax.optimization_barrier((middle.reshape(shape), chord.reshape(shape)))
-            for speed, weight in zip(speeds, _Boundary(*(x[e] for x in terms)).at_vertices(middle, chord), strict=True):
-                change -= _sum_all(speed[e] * weight)
+        change += _sum_all(moments(axes, v, degree) * jnp.swapaxes(d_weights, 0, 1)[1:])
+    if not isinstance(d_axes, SymbolicZero):
+        turned = jax.jvp(lambda a: moments(a, v, degree), (axes,), (d_axes,))[1]
+        change += _sum_all(turned * jnp.swapaxes(weights, 0, 1)[1:])
+    if not isinstance(dv, SymbolicZero):
+        spans = _spans(v)
+        at_vertices = _fold_boundary(weights, axes, spans, degree)
+        for speed, weight in zip(_speeds(_unpack(_Spans, spans), dv), at_vertices, strict=True):
+            change -= _sum_first(speed * weight)
     return value, change
 
 
-fold.defjvp(_fold_jvp, symbolic_zeros=True)
+_fold.defjvp(_fold_jvp, symbolic_zeros=True)
+
+
+def _fold_boundary(weights: Array, axes: Array, spans: Float[Array, "rows e p"], degree: int) -> tuple[Array, Array]:
+    """sum over k and l of weights[k, l] times the integrals of `_at_vertices`, [e, p] each."""
+    factors = _factors(1, degree, spans.dtype)
+    zero = jnp.zeros_like(spans[0, 0])
+
+    def edge(_: None, span: Float[Array, "rows p"]) -> tuple[None, tuple[Array, Array]]:
+        def axis(total: tuple[Array, Array], d: Array, w: Array) -> tuple[Array, Array]:
+            terms = _boundary(_unpack(_Spans, span), d)
+            state, middle, chord = terms.start(), zero, zero
+            for l in range(1, degree + 1):
+                state = terms.advance(state, _Factors(*(f[l - 1] for f in factors)))
+                middle, chord = middle + w[l] * state.middle, chord + w[l] * state.chord
+            return total[0] + middle, total[1] + chord
+
+        return None, _for_axes(axis, (zero, zero), axes, weights)
+
+    _, (middle, chord) = jax.lax.scan(edge, None, jnp.moveaxis(spans, 1, 0))
+    return _at_vertices(_unpack(_Spans, spans), middle, chord)
+
+
+def _for_axes(body: Callable, value: Value, axes: Array, weights: Array) -> Value:
+    """body(value, d, w) for all axes in turn.
+
+    Axis and weights are fetched a step ahead: the body then reads arrays, not rows at an address that it has to find,
+    which would keep LLVM from vector code.
+    """
+    fetch = lambda k: (axes[k], weights[k])
+
+    def step(state: tuple, following: Array) -> tuple[tuple, None]:
+        value, (d, w) = state
+        return (body(value, d, w), fetch(following)), None
+
+    count = axes.shape[0]
+    following = jnp.arange(1, count + 1, dtype=jnp.int32) % count
+    return jax.lax.scan(step, (value, fetch(0)), following)[0][0]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def moments(axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, "l k p"]:
     """I_l(axes[k]) for l = 1 ... degree."""
-    terms, total = _zonal_terms(_arcs(v), axes)
+    d, total, c, edges = _all_axes(_arcs(v), axes)
     first = 0.5 * total
     if degree == 1:
         return first[None]
+    terms = _zonal_terms(edges, d, c)
 
-    def step(state: tuple, n: _Factors) -> tuple[tuple, Array]:
-        state, change = terms.advance(state, n)
-        return state, _sum_edges(change) * n.laplacian
+    def step(state: tuple[_Point, list[_State]], n: _Factors) -> tuple[tuple[_Point, list[_State]], Array]:
+        point, states = state
+        states = [t.advance(s, point, n) for t, s in zip(terms, states, strict=True)]
+        point = c.advance(point, n)
+        change = total * point.r + sum(t.along * s.s for t, s in zip(terms, states, strict=True))
+        return (point, states), change * n.laplacian
 
-    _, rest = jax.lax.scan(step, terms.start(), _factors(2, degree, v.dtype))
+    _, rest = jax.lax.scan(step, (c.start(), [t.start() for t in terms]), _factors(2, degree, v.dtype))
     return jnp.concatenate([first[None], rest])
 
 
 def _moments_jvp(degree, primals, tangents):
     (axes, v), (d_axes, dv) = primals, tangents
     values = moments(axes, v, degree)
-    if isinstance(d_axes, SymbolicZero) and isinstance(dv, SymbolicZero):
+    speeds = []
+    packed = _spans(v)
+    spans = _unpack(_Spans, packed)
+    if not isinstance(dv, SymbolicZero):
+        speeds.append([x[:, None] for x in _speeds(spans, dv)])
+    if not isinstance(d_axes, SymbolicZero):  # in the frame that turns with each axis, the vertices turn back
+        turn = jnp.cross(axes, d_axes).T[:, None, :, None]
+        ends = (spans.start, spans.end)
+        speeds.append([-dot(turn, cross(x, spans.normal)[:, :, None]) for x in ends])
+    if not speeds:
         return values, jnp.zeros_like(values)
-    arcs = _arcs(v)
-    terms, speeds = _boundary_terms(arcs, axes), _edge_speeds(arcs, axes, d_axes, dv)
+    start, end = (functools.reduce(jnp.add, s) for s in zip(*speeds, strict=True))
+    spans = _unpack(_Spans, packed[:, :, None])
+    terms = _boundary(spans, axes.T[:, None, :, None])
 
-    def step(state: tuple, n: _Factors) -> tuple[tuple, Array]:
-        state, middle, chord = terms.advance(state, n)
-        a, b = terms.at_vertices(middle, chord)
-        return state, _sum_edges(speeds[0] * a + speeds[1] * b)
+    def step(state: _BoundaryState, n: _Factors) -> tuple[_BoundaryState, Array]:
+        state = terms.advance(state, n)
+        a, b = _at_vertices(spans, state.middle, state.chord)
+        return state, _sum_first(start * a + end * b)
 
     _, change = jax.lax.scan(step, terms.start(), _factors(1, degree, v.dtype))
     return values, -change
@@ -139,32 +211,33 @@ def powers(axes: Float[Array, "k 3"], v: Loop, solid_angle: Float[Array, " p"], 
 
     n F_n = (n-1) (1 - g^2) F_{n-2} - [u^(n-1) u'] along the edges, (n+1) A_n = (n-1) A_{n-2} + sum of g F_{n-1}.
     """
-    arcs = _arcs(v)
-    terms, total = _zonal_terms(arcs, axes)
-    u0, u1 = terms.u0, terms.u1
-    slope0 = terms.end_slope + terms.mean_u * arcs.angle[:, None]  # u'(a)
-    inside, none, inverse_angle = 1 - terms.g2, arcs.none[:, None], arcs.inverse(arcs.angle)[:, None]
+    d, total, c, edges = _all_axes(_arcs(v), axes)
     a = [jnp.broadcast_to(solid_angle[None], total.shape), 0.5 * total]
-    f = [jnp.ones_like(u0), terms.mean_u]  # F_n / theta
-    p0, p1 = u0, u1
+    a += [jnp.zeros_like(total)] * (order - 1)
+    for edge, x in zip(edges, _zonal_terms(edges, d, c), strict=True):
+        slope0 = x.end_slope + edge.t * (x.u0 + x.u1)  # u'(a)
+        f = [jnp.ones_like(x.u0), x.mean_u]  # F_n / theta
+        p0, p1 = x.u0, x.u1
+        for n in range(2, order + 1):
+            ends = jnp.where(edge.over_angle == 0, -p0 * x.u0, (p1 * x.end_slope - p0 * slope0) * edge.over_angle)
+            f.append(((n - 1) * (1 - x.g2) * f[n - 2] - ends) / n)
+            a[n] += x.along * f[n - 1]
+            p0, p1 = p0 * x.u0, p1 * x.u1
     for n in range(2, order + 1):
-        ends = jnp.where(none, -p0 * u0, (p1 * terms.end_slope - p0 * slope0) * inverse_angle)
-        f.append(((n - 1) * inside * f[n - 2] - ends) / n)
-        a.append(((n - 1) * a[n - 2] + _sum_edges(terms.along * f[n - 1])) / (n + 1))
-        p0, p1 = p0 * u0, p1 * u1
+        a[n] = ((n - 1) * a[n - 2] + a[n]) / (n + 1)
     return jnp.stack(a[: order + 1])
 
 
 class _Factors(NamedTuple):
-    """The numbers in the recurrences for degree l."""
+    """The numbers in the recurrences for degree l, NumPy's where code is unrolled and JAX's in a loop."""
 
-    up: Array | np.ndarray  # (2l-1)/l
-    back: Array | np.ndarray  # (l-1)/l
-    back2: Array | np.ndarray  # ((l-1)/l)^2
-    source: Array | np.ndarray  # (2l-1)/l^2
-    odd: Array | np.ndarray  # 2l-1
-    laplacian: Array | np.ndarray  # 1/(l(l+1))
-    next: Array | np.ndarray  # 1/(l+1)
+    up: Any  # (2l-1)/l
+    back: Any  # (l-1)/l
+    back2: Any  # ((l-1)/l)^2
+    source: Any  # (2l-1)/l^2
+    odd: Any  # 2l-1
+    laplacian: Any  # 1/(l(l+1))
+    next: Any  # 1/(l+1)
 
 
 def _factors(first: int, degree: int, dtype: jnp.dtype) -> _Factors:
@@ -175,32 +248,65 @@ def _factors(first: int, degree: int, dtype: jnp.dtype) -> _Factors:
     return _Factors(*(x.astype(dtype) for x in values))
 
 
-class _Arcs(NamedTuple):
-    """The edges a -> b of polygons, without reference to an axis, each [vertex, p] or [x y z, vertex, p]."""
+# ---- edges
+
+
+class _Edges(NamedTuple):
+    """Edges a -> b, without reference to an axis. What is over a length is 0 where there is none."""
+
+    tau: Array  # a = c + tau - kappa c
+    tau_next: Array  # of b
+    d_tau: Array  # their difference
+    normal: Array  # theta n
+    kappa: Array
+    kappa_next: Array
+    d_kappa: Array
+    over_angle: Array  # 1/theta
+    over_sine: Array
+    t: Array  # tan(theta/2)
+    over_t: Array
+    ratio_1: Array  # theta / sin(theta) - 1
+    mean: Array  # t / theta
+    excess: Array  # 1/2 - t / theta
+
+
+class _Spans(NamedTuple):
+    """Edges a -> b, as `_Boundary` needs them."""
 
     start: Array
     end: Array
-    c: Array  # the reference vertex [x y z, p]
-    tau: Array  # a = c + tau - kappa c
-    tau_next: Array
-    kappa: Array
-    kappa_next: Array
     chord: Array  # b - a
-    none: Array  # so short that it has no direction: its recurrence is that of a point
-    short: Array  # below a right angle
-    t: Array  # tan(theta/2)
-    tail: Array  # arctan(t)/t - 1
-    angle: Array  # theta
-    sine: Array
-    half_sine: Array  # sin(theta/2)
-    half_cosine: Array
-    ratio_1: Array  # theta / sin(theta) - 1
     normal: Array  # theta n
-    total: Array  # its sum over the edges [x y z, p]
+    angle: Array  # theta
+    over_angle: Array
+    half_sine: Array  # sin(theta/2)
+    over_half_sine: Array
+    over_half_cosine: Array
 
-    def inverse(self, x: Array) -> Array:
-        """1/x, 0 on edges of no length."""
-        return jnp.where(self.none, 0, 1 / jnp.where(self.none, 1, x))
+
+_VECTORS = {"tau", "tau_next", "d_tau", "normal", "start", "end", "chord"}
+
+
+def _pack(edges: _Edges | _Spans) -> Float[Array, "rows e p"]:
+    """One array, kept as such: XLA would make its parts again for every axis."""
+    edges = jax.lax.optimization_barrier(edges)
+    rows = [x if name in _VECTORS else x[None] for name, x in edges._asdict().items()]
+    return jax.lax.optimization_barrier(jnp.concatenate(rows))
+
+
+def _unpack(kind: type[Edges], rows: Array) -> Edges:
+    parts, used = [], 0
+    for name in kind._fields:
+        size = 3 if name in _VECTORS else 1
+        parts.append(rows[used : used + size] if size == 3 else rows[used])
+        used += size
+    return kind(*parts)
+
+
+class _Arcs(NamedTuple):
+    edges: Float[Array, "rows e p"]
+    c: Float[Array, "3 p"]  # the reference vertex
+    total: Float[Array, "3 p"]  # the sum of theta n over the edges
 
 
 def _arcs(v: Loop) -> _Arcs:
@@ -212,29 +318,115 @@ def _arcs(v: Loop) -> _Arcs:
     tau2 = dot(tau, tau)
     kappa = jnp.where(near, tau2 / (1 + jnp.sqrt(jnp.where(near, 1 - tau2, 1))), 1 - cosine)
     end, tau_next, kappa_next = jnp.roll(v, -1, 1), jnp.roll(tau, -1, 1), jnp.roll(kappa, -1, 0)
-    chord, middle = tau_next - tau - (kappa_next - kappa)[None] * c, v + end
-    chord2, middle2 = dot(chord, chord), dot(middle, middle)
-    t2 = chord2 / middle2
-    short = t2 < 1
-    t, tail = safe_sqrt(t2), _arctan_tail(t2)
+    d_tau, d_kappa = tau_next - tau, kappa_next - kappa
+    chord, middle = d_tau - d_kappa[None] * c, v + end
+    t2 = dot(chord, chord) / dot(middle, middle)
+    none, t, tail = _none(t2), safe_sqrt(t2), _arctan_tail(t2)
     ratio, ratio_1 = (1 + t2) * (1 + tail), t2 + tail * (1 + t2)  # theta / sin(theta)
-    normal = ratio[None] * cross(v, jnp.where(short[None], chord, middle))
+    short = (t2 < 1)[None]
+    normal = ratio[None] * cross(v, jnp.where(short, chord, middle))
     around = cross(jnp.broadcast_to(c, v.shape), chord)  # these add up to 0
     parts = ratio_1[None] * around + ratio[None] * cross(tau - kappa[None] * c, chord)
-    long = normal - around  # the same, where the chord is not small
-    arcs = _Arcs(
-        v, end, c[:, 0], tau, tau_next, kappa, kappa_next, chord,
-        none=t2 < (64 * jnp.finfo(v.dtype).eps) ** 2, short=short,
-        t=t, tail=tail, angle=2 * t * (1 + tail), sine=2 * t / (1 + t2),
-        half_sine=0.5 * safe_sqrt(chord2), half_cosine=0.5 * safe_sqrt(middle2),
-        ratio_1=ratio_1, normal=normal,
-        total=_sum_edges(jnp.moveaxis(jnp.where(short[None], parts, long), 1, 0)),
+    parts = jnp.where(short, parts, normal - around)  # the same, where the chord is not small
+    edges = _Edges(
+        tau, tau_next, d_tau, normal, kappa, kappa_next, d_kappa,
+        over_angle=_over(2 * t * (1 + tail), none), over_sine=_over(2 * t / (1 + t2), none),
+        t=t, over_t=_over(t, none), ratio_1=ratio_1, mean=0.5 / (1 + tail), excess=0.5 * tail / (1 + tail),
     )  # fmt: skip
-    return jax.lax.optimization_barrier(arcs)  # kept as arrays: XLA would compute them again for every axis
+    total = _sum_first(jnp.moveaxis(parts, 1, 0))
+    return _Arcs(_pack(edges), *jax.lax.optimization_barrier((c[:, 0], total)))
+
+
+def _spans(v: Loop) -> Float[Array, "rows e p"]:
+    end = jnp.roll(v, -1, 1)
+    chord, middle = end - v, v + end
+    chord2, middle2 = dot(chord, chord), dot(middle, middle)
+    t2 = chord2 / middle2
+    none, tail = _none(t2), _arctan_tail(t2)
+    angle, half_sine = 2 * safe_sqrt(t2) * (1 + tail), 0.5 * safe_sqrt(chord2)
+    normal = ((1 + t2) * (1 + tail))[None] * cross(v, jnp.where((t2 < 1)[None], chord, middle))
+    over_half_cosine = 2 / jnp.sqrt(middle2)
+    spans = _Spans(
+        v, end, chord, normal, angle, _over(angle, none), half_sine, _over(half_sine, none), over_half_cosine
+    )
+    return _pack(spans)
+
+
+def _none(t2: Array) -> Array:
+    """So short that it has no direction: its recurrence is that of a point."""
+    return t2 < (64 * jnp.finfo(t2.dtype).eps) ** 2
+
+
+def _over(x: Array, none: Array) -> Array:
+    return jnp.where(none, 0, 1 / jnp.where(none, 1, x))
+
+
+# ---- the recurrence for I_l
+
+
+class _Point(NamedTuple):
+    """P_{l-1}(u_c), by its size and sign, P_{l-2}' and P_{l-1}'."""
+
+    step: Array  # of the size, from degree l-2
+    size: Array
+    sign: Array
+    p: Array
+    r0: Array
+    r: Array
+
+
+class _Reference(NamedTuple):
+    """An axis, as the reference vertex sees it: exact also where it is near c or -c."""
+
+    u: Array  # c . d
+    sign: Array
+    gap: Array  # 1 - |u|
+    offset: tuple[Array, Array, Array]  # d - sign c
+
+    def project(self, tau: Array, kappa: Array) -> Array:
+        """d . (tau - kappa c): the height of a vertex over c, or a difference of heights."""
+        return dot(tau, self.offset) - kappa * self.u
+
+    def start(self) -> _Point:
+        size = 1 - self.gap
+        return _Point(-self.gap, size, self.sign, self.u, jnp.zeros_like(size), jnp.ones_like(size))
+
+    def advance(self, point: _Point, n: _Factors) -> _Point:
+        """From degree l-1 to l: |P_l| of |u| by its differences in l."""
+        step = n.back * point.step - n.up * self.gap * point.size
+        size, sign = point.size + step, point.sign * self.sign
+        return _Point(step, size, sign, sign * size, point.r, point.r0 + n.odd * point.p)
+
+
+def _reference(c: Array, d: Array) -> _Reference:
+    sign = jnp.where(dot(d, c) < 0, -1, 1).astype(c.dtype)
+    offset = (d[0] - sign * c[0], d[1] - sign * c[1], d[2] - sign * c[2])
+    gap = 0.5 * dot(offset, offset)
+    return _Reference(sign * (1 - gap), sign, gap, offset)
+
+
+def _all_axes(arcs: _Arcs, axes: Float[Array, "k 3"]) -> tuple[Array, Array, _Reference, list[_Edges]]:
+    """Axes [x y z, k, 1], T [k, p], the reference and the edges."""
+    d = axes.T[:, :, None]
+    edges = [_unpack(_Edges, arcs.edges[:, e, None]) for e in range(arcs.edges.shape[1])]
+    return d, dot(arcs.total[:, None], d), _reference(arcs.c[:, None], d), edges
+
+
+class _State(NamedTuple):
+    """Differences to the reference of P_l(u) at a, its quotient, E_l and D_l over theta, at degrees l-2 and l-1."""
+
+    q0: Array
+    q: Array
+    dq0: Array
+    dq: Array
+    e0: Array
+    e: Array
+    s0: Array
+    s: Array
 
 
 class _Zonal(NamedTuple):
-    """What the recurrence for I_l needs of edges and axes, in arrays of one shape."""
+    """What the recurrence for I_l needs of an edge and an axis."""
 
     u0: Array
     u1: Array
@@ -247,64 +439,69 @@ class _Zonal(NamedTuple):
     along: Array  # G = theta g
     of_value: Array  # coefficients, in the difference of [u' P_l] + g^2 D_l to its value at c, of P_l(u_c) ...
     of_derivative: Array  # ... and of P_l'(u_c)
-    sign: Array  # of u_c
-    gap: Array  # 1 - |u_c|
-    share: Array  # T over the number of edges
 
-    def start(self) -> tuple:
-        zero, one = jnp.zeros_like(self.u0), jnp.ones_like(self.u0)
-        reference = (-self.gap, 1 - self.gap, self.sign, one, zero, one)
-        return zero, self.y0, zero, zero, zero, -self.of_value, zero, zero, *reference
+    def start(self) -> _State:
+        zero = jnp.zeros_like(self.u0)
+        return _State(zero, self.y0, zero, zero, zero, -self.of_value, zero, zero)
 
-    def advance(self, state: tuple, n: _Factors) -> tuple[tuple, Array]:
-        """From degree l-1 to l: the new state, and what the edge adds to l (l+1) I_l."""
-        q0, q, dq0, dq, e0, e, s0, s, step_c, size_c, sign_c, p_c0, r_c0, r_c = state
-        up, back = n.up, n.back
-        p_c = sign_c * size_c
-        ends = self.end_slope * dq - self.mean_u * q + self.g2 * s + self.of_value * p_c + self.of_derivative * r_c
-        e_next, s_next = n.back2 * e0 - n.source * ends, s0 + n.odd * e
-        dq_next = up * (self.u1 * dq + self.slope * (q + self.y1 * r_c)) - back * dq0
-        q_next = up * (self.u0 * q + self.y0 * p_c) - back * q0
-        # |P_l| of |u_c| by its differences in l, exact near u_c = +-1
-        step_c = back * step_c - up * self.gap * size_c
-        r_next = r_c0 + n.odd * p_c
-        reference = (step_c, size_c + step_c, sign_c * self.sign, p_c, r_c, r_next)
-        change = s_next * self.along + r_next * self.share
-        return (q, q_next, dq, dq_next, e, e_next, s, s_next, *reference), change
+    def advance(self, x: _State, c: _Point, n: _Factors) -> _State:
+        """From degree l-1 to l. The edge adds G (D_l/theta + P_l'(u_c)) to l (l+1) I_l."""
+        ends = (
+            self.end_slope * x.dq - self.mean_u * x.q + self.g2 * x.s + self.of_value * c.p + self.of_derivative * c.r
+        )
+        return _State(
+            x.q, n.up * (self.u0 * x.q + self.y0 * c.p) - n.back * x.q0,
+            x.dq, n.up * (self.u1 * x.dq + self.slope * (x.q + self.y1 * c.r)) - n.back * x.dq0,
+            x.e, n.back2 * x.e0 - n.source * ends,
+            x.s, x.s0 + n.odd * x.e,
+        )  # fmt: skip
 
 
-def _zonal_terms(arcs: _Arcs, axes: Float[Array, "k 3"]) -> tuple[_Zonal, Float[Array, "k p"]]:
-    """The terms [e, k, p], and T."""
-    d, c = axes.T[:, :, None], arcs.c[:, None]
-    # c . d and differences to it, exact also where d is near c or -c
-    sign = jnp.where(dot(d, c) < 0, -1, 1).astype(c.dtype)
-    offset = d - sign[None] * c
-    gap = 0.5 * dot(offset, offset)
-    u_c = (sign * (1 - gap))[None]
-    project = lambda tau, kappa: dot(tau[:, :, None], offset[:, None]) - kappa[:, None] * u_c
-    y0, y1 = project(arcs.tau, arcs.kappa), project(arcs.tau_next, arcs.kappa_next)
-    u0, u1 = u_c + y0, u_c + y1
-    rise = project(arcs.tau_next - arcs.tau, arcs.kappa_next - arcs.kappa)  # u1 - u0
-    t, tail, ratio_1 = arcs.t[:, None], arcs.tail[:, None], arcs.ratio_1[:, None]
-    inverse_angle, over_sine, over_t = (arcs.inverse(x)[:, None] for x in (arcs.angle, arcs.sine, arcs.t))
-    slope, both = rise * inverse_angle, u0 + u1
-    end_slope = jnp.where(arcs.short[:, None], rise * over_sine - u1 * t, u1 * over_t - both * over_sine)
-    along = dot(arcs.normal[:, :, None], d[:, None])
-    total = dot(arcs.total[:, None], d)
-    terms = _Zonal(
+def _zonal_terms(edges: list[_Edges], d: Array, c: _Reference) -> list[_Zonal]:
+    """Of edges that follow each other, whose common vertices are projected once."""
+    heights = [c.project(edge.tau, edge.kappa) for edge in edges]
+    heights.append(c.project(edges[-1].tau_next, edges[-1].kappa_next))
+    return [_zonal(edge, d, c, y0, y1) for edge, y0, y1 in zip(edges, heights[:-1], heights[1:], strict=True)]
+
+
+def _zonal(edge: _Edges, d: Array, c: _Reference, y0: Array, y1: Array) -> _Zonal:
+    u0, u1, rise = c.u + y0, c.u + y1, c.project(edge.d_tau, edge.d_kappa)
+    slope, both, along = rise * edge.over_angle, u0 + u1, dot(edge.normal, d)
+    end_slope = jnp.where(edge.t < 1, rise * edge.over_sine - u1 * edge.t, u1 * edge.over_t - both * edge.over_sine)
+    return _Zonal(
         u0, u1, y0, y1, slope, end_slope,
-        mean_u=both * (0.5 / (1 + tail)),
-        g2=jnp.where(arcs.none[:, None], 1 - u1 * u1, (along * inverse_angle) ** 2),
+        mean_u=both * edge.mean,
+        g2=jnp.where(edge.over_angle == 0, 1 - u1 * u1, (along * edge.over_angle) ** 2),
         along=along,
-        of_value=both * (0.5 * tail / (1 + tail)) - 0.5 * (y0 + y1),
-        of_derivative=end_slope * (u1 * t - slope * ratio_1) - y1 * (u1 + u_c),
-        sign=sign[None], gap=gap[None], share=total[None] / len(u0),
+        of_value=both * edge.excess - 0.5 * (y0 + y1),
+        of_derivative=end_slope * (u1 * edge.t - slope * edge.ratio_1) - y1 * (u1 + c.u),
     )  # fmt: skip
-    return _Zonal(*(jnp.broadcast_to(x, u0.shape) for x in terms)), total
+
+
+# ---- the recurrence for its derivatives
+
+
+class _BoundaryState(NamedTuple):
+    """P_{l-1}(u) at a and its quotient, E and D, V_{l-1} and the two last Z, over theta, with those of degree l-2."""
+
+    q0: Array
+    q: Array
+    dq0: Array
+    dq: Array
+    e0: Array
+    e: Array
+    s0: Array
+    s: Array
+    middle: Array
+    chord: Array
+    z_middle0: Array
+    z_middle: Array
+    z_chord0: Array
+    z_chord: Array
 
 
 class _Boundary(NamedTuple):
-    """What the integrals V_l of P_l(u) w ds along the edges need, from which come derivatives.
+    """What the integrals V_l of P_l(u) w ds along an edge need, from which come derivatives.
 
     Integrating P_l w' by parts, with d' the part of d in the plane of the edge and Z_l the integral of P_l'(u) w ds:
     (l+1) V_l = d' D_l - Z_{l-1} - [P_l w'],  Z_l = Z_{l-2} + (2l-1) V_{l-1}, and the integral of u P_l is V_l . d.
@@ -317,85 +514,49 @@ class _Boundary(NamedTuple):
     d_middle: Array
     d_chord: Array
     weight: Array  # sin(theta/2) / theta
-    length: Array  # theta
+    angle: Array
     half_cosine: Array
-    inverse_half_sine: Array
 
-    def start(self) -> tuple:
+    def start(self) -> _BoundaryState:
         zero, one = jnp.zeros_like(self.u0), jnp.ones_like(self.u0)
-        return zero, one, zero, zero, zero, one, zero, zero, 2 * self.weight, zero, zero, zero, zero, zero
+        middle = 2 * self.weight + zero
+        return _BoundaryState(zero, one, zero, zero, zero, one, zero, zero, middle, zero, zero, zero, zero, zero)
 
-    def advance(self, state: tuple, n: _Factors) -> tuple[tuple, Array, Array]:
-        """From degree l-1 to l: the new state, and the two components of V_l."""
-        q0, q, dq0, dq, e0, e, s0, s, middle, chord, z_middle0, z_middle, z_chord0, z_chord = state
-        up, back = n.up, n.back
-        q_next, dq_next = up * self.u0 * q - back * q0, up * (self.u1 * dq + self.slope * q) - back * dq0
-        s_next = s0 + n.odd * e
-        e_next = up * (self.d_middle * middle + self.d_chord * chord) - back * e0
-        z_middle_next, z_chord_next = z_middle0 + n.odd * middle, z_chord0 + n.odd * chord
-        middle = n.next * (self.d_middle * s_next - z_middle + self.weight * (2 * q_next + self.length * dq_next))
-        chord = n.next * (self.d_chord * s_next - z_chord - self.half_cosine * dq_next)
-        z = (z_middle, z_middle_next, z_chord, z_chord_next)
-        return (q, q_next, dq, dq_next, e, e_next, s, s_next, middle, chord, *z), middle, chord
-
-    def at_vertices(self, middle: Array, chord: Array) -> tuple[Array, Array]:
-        """Integrals of P_l(u) times the weights of a and of b in w = (sin(theta - s) a + sin(s) b) / sin(theta)."""
-        middle, chord = 0.5 * middle / self.half_cosine, 0.5 * chord * self.inverse_half_sine
-        return middle - chord, middle + chord
+    def advance(self, x: _BoundaryState, n: _Factors) -> _BoundaryState:
+        """From degree l-1 to l."""
+        q = n.up * self.u0 * x.q - n.back * x.q0
+        dq = n.up * (self.u1 * x.dq + self.slope * x.q) - n.back * x.dq0
+        s = x.s0 + n.odd * x.e
+        e = n.up * (self.d_middle * x.middle + self.d_chord * x.chord) - n.back * x.e0
+        return _BoundaryState(
+            x.q, q, x.dq, dq, x.e, e, x.s, s,
+            n.next * (self.d_middle * s - x.z_middle + self.weight * (2 * q + self.angle * dq)),
+            n.next * (self.d_chord * s - x.z_chord - self.half_cosine * dq),
+            x.z_middle, x.z_middle0 + n.odd * x.middle, x.z_chord, x.z_chord0 + n.odd * x.chord,
+        )  # fmt: skip
 
 
-def _boundary_terms(arcs: _Arcs, axes: Float[Array, "k 3"]) -> _Boundary:
-    """The terms [e, k, p]."""
-    d = axes.T[:, None, :, None]
-    u0, u1 = (dot(x[:, :, None], d) for x in (arcs.start, arcs.end))
-    rise = dot((arcs.tau_next - arcs.tau - (arcs.kappa_next - arcs.kappa)[None] * arcs.c[:, None])[:, :, None], d)
-    half_sine, half_cosine, angle = arcs.half_sine, arcs.half_cosine[:, None], arcs.angle
-    inverse_angle, inverse_half_sine = (arcs.inverse(x)[:, None] for x in (angle, half_sine))
-    terms = _Boundary(
+def _boundary(span: _Spans, d: Array) -> _Boundary:
+    u0, u1, rise = dot(span.start, d), dot(span.end, d), dot(span.chord, d)
+    return _Boundary(
         u0, u1,
-        slope=rise * inverse_angle,
-        d_middle=0.5 * (u0 + u1) / half_cosine,
-        d_chord=0.5 * rise * inverse_half_sine,
-        weight=jnp.where(arcs.none, 0.5, half_sine * inverse_angle[:, 0])[:, None],
-        length=angle[:, None], half_cosine=half_cosine, inverse_half_sine=inverse_half_sine,
+        slope=rise * span.over_angle,
+        d_middle=0.5 * (u0 + u1) * span.over_half_cosine,
+        d_chord=0.5 * rise * span.over_half_sine,
+        weight=jnp.where(span.over_angle == 0, 0.5, span.half_sine * span.over_angle),
+        angle=span.angle, half_cosine=1 / span.over_half_cosine,
     )  # fmt: skip
-    return _Boundary(*(jnp.broadcast_to(x, u0.shape) for x in terms))
 
 
-def _edges(terms: _Zonal | _Boundary) -> list:
-    """The terms of each edge as plain vectors over axes and points, so that one kernel runs over memory in order."""
-    return [type(terms)(*jax.lax.optimization_barrier([x[e].reshape(-1) for x in terms])) for e in range(len(terms.u0))]
+def _at_vertices(span: _Spans, middle: Array, chord: Array) -> tuple[Array, Array]:
+    """Integrals of P_l(u) times the weights of a and of b in w = (sin(theta - s) a + sin(s) b) / sin(theta)."""
+    middle, chord = 0.5 * middle * span.over_half_cosine, 0.5 * chord * span.over_half_sine
+    return middle - chord, middle + chord
 
 
-def _flat(weights: Float[Array, "l k q"], like: Float[Array, "k p"]) -> Float[Array, "l kp"]:
-    return jnp.broadcast_to(weights, (weights.shape[0], *like.shape)).reshape(weights.shape[0], -1)
-
-
-def _edge_speeds(
-    arcs: _Arcs, axes: Float[Array, "k 3"], d_axes: Array | SymbolicZero, dv: Array | SymbolicZero
-) -> tuple[Array, Array]:
-    """theta n . velocity of both ends of every edge [e, k or 1, p], in the frame that turns with each axis."""
-    speeds = [jnp.zeros_like(arcs.angle)[:, None]] * 2
-    if not isinstance(dv, SymbolicZero):
-        speeds = [dot(arcs.normal, x)[:, None] for x in (dv, jnp.roll(dv, -1, 1))]
-    if not isinstance(d_axes, SymbolicZero):
-        turn = jnp.cross(axes, d_axes).T[:, None, :, None]
-        ends = (arcs.start, arcs.end)
-        speeds = [s - dot(turn, cross(x, arcs.normal)[:, :, None]) for s, x in zip(speeds, ends, strict=True)]
-    return speeds[0], speeds[1]
-
-
-def _sweep(
-    step: Callable, state: tuple, degree: int, weights: Float[Array, "l kp"], edge: tuple, first: int = 2
-) -> tuple:
-    """`state` after steps of degree `first` ... `degree`, as straight code or, for high degrees, as a loop."""
-    factors = _factors(first, degree, weights.dtype)
-    if degree > _UNROLLED:
-        body = lambda state, x: (step(state, *x, edge), None)
-        return jax.lax.scan(body, state, (factors, weights[first:]))[0]
-    for l in range(first, degree + 1):
-        state = step(state, _Factors(*(f[l - first] for f in factors)), weights[l], edge)
-    return state
+def _speeds(spans: _Spans, dv: Loop) -> tuple[Array, Array]:
+    """theta n . velocity of both ends of every edge, [e, p]."""
+    return dot(spans.normal, dv), dot(spans.normal, jnp.roll(dv, -1, 1))
 
 
 def _sum_all(x: Array) -> Float[Array, " p"]:
@@ -404,7 +565,7 @@ def _sum_all(x: Array) -> Float[Array, " p"]:
     return (jnp.ones((1, x.shape[0]), x.dtype) @ x)[0]
 
 
-def _sum_edges(x: Array) -> Array:
+def _sum_first(x: Array) -> Array:
     """Sum over the first axis, written out for the same reason."""
     return functools.reduce(jnp.add, [x[i] for i in range(x.shape[0])])
 

@@ -35,7 +35,8 @@ from shisd.shading._lobes import Lobes, lookup_table
 from shisd.shading._surface import in_tiles, shade_tiles, surface
 
 Light = PolygonLight | PortalLight
-_TILE = 128  # pixels at a time
+_TILE = 1024  # pixels at a time
+_SMALL_TILE = 128  # where every pixel holds the moments about all axes
 
 
 def shade_polygon(
@@ -58,7 +59,7 @@ def shade_polygon(
     quadrature of the material itself, with domain="upper" and degree 20: relative RMSE below 3e-5 for Lambertian, 1e-4
     for GGX of alpha 0.5.
     Cost: moments at 2L+1 axes for every pixel, light and colour of the material; of lights with a profile, that of
-    `shade_portal`. Memory: one tile of 128 pixels.
+    `shade_portal`. Memory: one tile of 1024 pixels.
     """
     return _shade_lights(lobes, light, PolygonLight, "light", positions, normals, views, tangents)
 
@@ -162,7 +163,8 @@ def _shade(
             total += jnp.broadcast_to(_times(lit, sign), total.shape)
         return total
 
-    return shade_tiles(lobes, table, points, colour, _TILE, radiance)
+    size = _TILE if all(product is None for product in products) else _SMALL_TILE
+    return shade_tiles(lobes, table, points, colour, size, radiance)
 
 
 @eqx.filter_jit
@@ -187,7 +189,8 @@ def _project(light: Light, positions: Float[Array, "p 3"], basis: int | HaarBasi
                 c = _through(product, v, angle)
         return jnp.moveaxis(_times(c, sign), -1, 0)
 
-    return in_tiles(project, {"positions": positions}, _TILE if isinstance(basis, int) else 1 + 2048 // basis.size)
+    size = 1 + 2048 // basis.size if isinstance(basis, HaarBasis) else _SMALL_TILE
+    return in_tiles(project, {"positions": positions}, size)
 
 
 def _outline(light: Light, position: Float[Array, "p 3"], frame: Float[Array, "p 3 3"]) -> tuple[Loop, Array]:
@@ -217,7 +220,7 @@ def _constant(c: Float[Array, "n p"], v: Loop, solid_angle: Array, axes: Array, 
     """Integrals of expansions, each over its loop: weights lambda_l = (inverse_l)^T c_l on moments about the axes."""
     _, inverse = zonal_inverse(degree, c.dtype)
     bands = [slice(l * l, (l + 1) ** 2) for l in range(degree + 1)]
-    weights = jnp.stack([jnp.asarray(inverse[b].T) @ c[b] for b in bands])
+    weights = jnp.stack([jnp.asarray(inverse[b].T) @ c[b] for b in bands], axis=1)  # k l p
     return c[0] * (solid_angle * np.sqrt(1 / (4 * np.pi))) + _moments.fold(weights, axes, v, degree)
 
 

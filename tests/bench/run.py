@@ -205,14 +205,14 @@ def bench_polygons(degrees=(8, 20)):
     angle = (np.arange(4) + rng.uniform(-0.3, 0.3, (PIXELS, 4)))[..., None] * (np.pi / 2)
     quads = np.cos(0.5) * z + np.sin(0.5) * (np.cos(angle) * x + np.sin(angle) * np.cross(z, x))
     quads = quads.astype(np.float32)
-    tiles = jnp.asarray(quads.reshape(-1, 128, 4, 3).transpose(0, 3, 2, 1))
+    tiles = jnp.asarray(quads.reshape(-1, 8192, 4, 3).transpose(0, 3, 2, 1))
     rows = []
     for degree in degrees:
         axes = unit(rng.normal(size=(2 * degree + 1, 3))).astype(np.float32)
         w = rng.normal(size=(degree + 1, len(axes))).astype(np.float32)
         w[0] = 0
         fold = lambda v, axes=axes, w=w, degree=degree: jax.lax.map(
-            jax.checkpoint(lambda tile: _moments.fold(jnp.asarray(w)[..., None], jnp.asarray(axes), tile, degree)), v
+            jax.checkpoint(lambda tile: _moments.fold(jnp.asarray(w).T[..., None], jnp.asarray(axes), tile, degree)), v
         ).reshape(-1)
         ours = jax.jit(fold)
         gradient = jax.jit(jax.value_and_grad(lambda v, fold=fold: jnp.sum(fold(v))))
