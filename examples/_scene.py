@@ -1,5 +1,7 @@
-"""What a picture needs besides shading: a camera, an object's visible points, and pixels put back in their places."""
+"""What a picture needs besides shading: a camera, an object's visible points, pixels in their places, and a folder."""
 
+import argparse
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +22,17 @@ class View:
         image = np.broadcast_to(background, (*self.seen.shape, 3)).copy()
         image[self.seen] = values
         return image
+
+
+def prepare_output(folder: Path, overwrite: bool, mark: str, parser: argparse.ArgumentParser) -> None:
+    """An empty folder. One that exists is replaced only when asked, and only if it holds `mark` or nothing."""
+    if folder.exists():
+        if not overwrite:
+            parser.error(f"{folder} exists. Name another --output, or replace it with --overwrite.")
+        if not (folder / mark).exists() and any(folder.iterdir()):
+            parser.error(f"{folder} was not written by this program and is left alone. Name another --output.")
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ import argparse
 import csv
 import functools
 import itertools
-import shutil
 import tempfile
 import time
 import warnings
@@ -250,13 +249,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
     options = parser.parse_args(arguments)
-    if options.output.exists():
-        if not options.overwrite:
-            parser.error(f"{options.output} exists. Name another --output, or replace it with --overwrite.")
-        if not (options.output / "relight.csv").exists() and any(options.output.iterdir()):
-            parser.error(f"{options.output} was not written by this program and is left alone. Name another --output.")
-        shutil.rmtree(options.output)
-    options.output.mkdir(parents=True)
+    _scene.prepare_output(options.output, options.overwrite, "relight.csv", parser)
     start = time.perf_counter()
     rows = run(options.output, options.size, options.samples, options.seed, tuple(sorted(options.degrees)))
     with (options.output / "relight.csv").open("w", newline="") as file:

@@ -356,7 +356,7 @@ def _faces(corners: Array, two_sided: bool, where: Array) -> tuple[Array, Array]
     """The unit normal of the emitting side, and whether a point sees light."""
     edges = corners[1:] - corners[:1]
     normal = jnp.sum(jnp.cross(edges[:-1], edges[1:]), axis=0)
-    normal = normal / jnp.sqrt(jnp.sum(normal * normal))
+    normal /= jnp.sqrt(jnp.sum(normal * normal))
     side = jnp.dot(where - corners[0], normal)
     return normal, (side != 0) & two_sided | (side > 0)
 
@@ -390,7 +390,7 @@ def _polygon_monte_carlo(
         distance2 = jnp.sum(offset * offset, axis=1)
         wi = offset / jnp.sqrt(distance2)[:, None]
         weight = jnp.sign(signed)[index].reshape(-1) * jnp.sum(jnp.abs(signed)) * jnp.abs(wi @ normal) / distance2
-        terms = _times(weight * seen, _arriving(brdf, radiance, frame, wo, wi @ frame.T), 1)
+        terms = _times(jnp.where(seen, weight, 0), _arriving(brdf, radiance, frame, wo, wi @ frame.T), 1)
         terms = terms.reshape(2, -1, *terms.shape[1:]) / index.size
         return jnp.sum(terms, axis=(0, 1)), jnp.sqrt(jnp.sum((terms[0] - terms[1]) ** 2, axis=0))
 
@@ -426,7 +426,7 @@ def _polygon_quadrature(
         def triangle(edge: tuple[Array, Array]) -> Array:
             b, c = edge
             area = jnp.dot(jnp.cross(b - some, c - some), normal)
-            offset = some[None] + s * (b - some + t * (c - b))
+            offset = some[None] + s * ((b - some)[None] + t * (c - b)[None])
             distance2 = jnp.sum(offset * offset, axis=1)
             wi = offset / jnp.sqrt(distance2)[:, None]
             weights = weight * area * jnp.abs(wi @ normal) / distance2

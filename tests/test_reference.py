@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from shisd import models, reference
+from tests import truth
 
 SUN_ROW, SUN_COLUMN, HEIGHT = 60, 37, 256
 
@@ -179,3 +180,53 @@ def test_the_reference_shares_nothing_with_the_fast_path():
     tree = ast.parse(Path(reference.__file__).read_text())
     own = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and "shisd" in node.module}
     assert own <= {"shisd", "shisd._numerics", "shisd._typing", "shisd.models"}, own
+
+
+BRDF = models.Ggx(0.5, 0.04)
+STAR = np.array([[0.9, 0.3, 0.5, 0.2, 0.8, 0.3]] * 3).T * np.stack(
+    [np.sin(np.arange(6) * np.pi / 3), np.cos(np.arange(6) * np.pi / 3), np.zeros(6)], axis=1
+) + [0.1, 0.0, 1.0]  # turns inwards twice; emits downwards
+
+
+def polygon_scene(rng, count):
+    position, normal = rng.uniform(-0.8, 0.8, (count, 3)) * [1, 1, 0.3], rng.normal(size=(count, 3)) + [0, 0, 1]
+    return position, normal, normal + 0.5 * rng.normal(size=(count, 3))
+
+
+def test_polygons_by_area_and_by_quadrature(x64, rng):
+    """Both agree, and for a constant integrand over the hemisphere with an independent rule on the sphere."""
+    position, normal, view = polygon_scene(rng, 24)
+    radiance = lambda w: jnp.stack([jnp.ones(w.shape[0]), 1 + w[:, 0]], axis=-1)
+    shade = lambda nodes: np.asarray(
+        reference.shade_polygon_quadrature(BRDF, STAR, radiance, position, normal, view, nodes=nodes)
+    )
+    exact = shade(48)
+    np.testing.assert_allclose(shade(40), exact, atol=1e-12 * exact.max())
+    estimate = reference.shade_polygon(
+        BRDF, STAR, radiance, position, normal, view, key=jax.random.key(3), samples=2048
+    )
+    off = (np.asarray(estimate.value) - exact) / np.maximum(np.asarray(estimate.standard_error), 1e-12)
+    lit = exact[:, 0] > 0
+    assert np.max(np.abs(off[lit])) < 5 and 0.7 < np.sqrt(np.mean(off[lit] ** 2)) < 1.4
+    for p, n, got in zip(position, normal, reference.shade_polygon_quadrature(
+        models.Lambertian(np.pi), STAR, 1.0, position, normal, normal, nodes=48
+    ), strict=True):  # fmt: skip
+        w, area = truth.triangle_rule((STAR - p) / np.linalg.norm(STAR - p, axis=1, keepdims=True), 60)
+        cosine = w.astype(float) @ (n / np.linalg.norm(n))
+        if cosine.min() > 0:
+            np.testing.assert_allclose(got, -float(area.astype(float) @ cosine), rtol=1e-10)
+
+
+def test_polygons_seen_from_behind_are_dark(rng):
+    position, normal, view = (x.astype(np.float32) for x in polygon_scene(rng, 4))
+    star = STAR[::-1].astype(np.float32).copy()
+    for shade in (
+        lambda **options: reference.shade_polygon_quadrature(BRDF, star, 1.0, position, normal, view, **options),
+        lambda **options: (
+            reference.shade_polygon(
+                BRDF, star, 1.0, position, normal, view, key=jax.random.key(0), samples=32, **options
+            ).value
+        ),
+    ):
+        np.testing.assert_array_equal(shade(), 0)
+        assert np.any(np.asarray(shade(two_sided=True)) > 0)

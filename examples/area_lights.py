@@ -1,0 +1,238 @@
+"""Light a room by a square, a triangle, a star and a window onto a photographed studio, and measure error and cost.
+
+The floor is a measured-like gold paint, the walls are matt. Every light is integrated exactly over its outline (CSH18
+Eq. 12; the window with the studio as spherical harmonics, Eq. 13) and compared with a converged reference: Gauss
+quadrature over the part of each light above the horizon; for the window, Monte Carlo with the map itself, whose noise
+is known and taken off. Writes pictures and a table to --output.
+
+    python examples/area_lights.py --output output/area_lights
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import _scene
+import jax
+import numpy as np
+from relight import compare, gold_metallic_paint, load_map
+from tqdm import tqdm
+
+from shisd import decomposition, io, models, plotting, reference, shading
+
+BOX = np.array([[-3.0, 0.0, 0.0], [3.0, 6.0, 3.0]])
+EYE, TARGET = np.array([0.4, 0.25, 1.55]), np.array([-0.15, 4.0, 0.75])
+DEGREES = {"floor": 20, "walls": 8}
+WORST, BEST = 1e-1, 1e-6  # relative errors at the ends of the false-colour scale
+
+
+def outline(centre: tuple, normal: tuple, plane: np.ndarray) -> np.ndarray:
+    """World points [S, 3] of an outline [S, 2] about a centre, counter-clockwise seen from the side of the normal."""
+    n = _scene.unit(np.array(normal, float))
+    right = _scene.unit(np.cross([0.0, 0.0, 1.0] if abs(n[2]) < 0.9 else [0.0, 1.0, 0.0], n))
+    return centre + plane[:, :1] * right + plane[:, 1:] * np.cross(n, right)
+
+
+def star(points: int, outer: float, inner: float) -> np.ndarray:
+    angle = np.pi / points * np.arange(2 * points) + np.pi / 2
+    return np.where(np.arange(2 * points)[:, None] % 2, inner, outer) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def square(width: float, height: float) -> np.ndarray:
+    return np.array([[-width, -height], [width, -height], [width, height], [-width, height]]) / 2
+
+
+def lights() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Outlines, and radiance in linear RGB."""
+    return {
+        "square": (outline((-0.9, 4.1, 2.3), (0.2, -0.3, -1), square(1.1, 0.8)), np.array([3.0, 2.6, 2.0])),
+        "triangle": (
+            outline((0.35, 5.2, 0.9), (-0.1, -1, -0.25), 0.55 * star(3, 1, 0.5)[::2]),
+            np.array([0.3, 1.2, 3.0]),
+        ),
+        "star": (outline((1.7, 4.3, 1.35), (-1, -0.9, -0.35), star(5, 0.8, 0.32)), np.array([3.0, 0.5, 0.25])),
+    }
+
+
+def window() -> np.ndarray:
+    return outline((-3.0, 3.9, 1.45), (1, 0, 0), square(1.9, 1.3))
+
+
+def room(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points [N, 3] where rays from inside leave the box, its normals there, and whether they are of the floor."""
+    with np.errstate(divide="ignore"):
+        along = np.where(rays > 0, BOX[1] - EYE, BOX[0] - EYE) / rays
+    axis = np.argmin(along, axis=1)
+    ray = np.arange(len(rays))
+    normals = np.zeros_like(rays)
+    normals[ray, axis] = -np.sign(rays[ray, axis])
+    return EYE + along[ray, axis][:, None] * rays, normals, normals[:, 2] > 0
+
+
+def covers(points: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Which rays from the eye go through a flat outline: those that it winds around."""
+    edges = points[1:] - points[:1]
+    normal = np.cross(edges[:-1], edges[1:]).sum(axis=0)
+    along = ((points[0] - EYE) @ normal) / (rays @ normal)
+    a = points - (EYE + along[:, None] * rays)[:, None]
+    b = np.roll(a, -1, axis=1)
+    turn = np.arctan2(np.cross(a, b) @ _scene.unit(normal), np.sum(a * b, axis=-1)).sum(axis=1)
+    return (along > 0) & (np.abs(turn) > np.pi)
+
+
+def timed(function: Callable, *arguments) -> tuple[np.ndarray, float]:
+    """The result, and the seconds of a second call, after compiling."""
+    jax.block_until_ready(function(*arguments))
+    start = time.perf_counter()
+    result = jax.block_until_ready(function(*arguments))
+    return np.asarray(result, float), time.perf_counter() - start
+
+
+def run(output: Path, size: int, nodes: int, samples: int) -> list[dict]:
+    rays = _scene.camera_rays(size, EYE, TARGET, np.radians(72))[size // 6 : -size // 6 or None]
+    shape, flat = rays.shape[:2], rays.reshape(-1, 3)
+    positions, normals, floor = room(flat)
+    surfaces = {"floor": floor, "walls": ~floor}
+    brdfs = {"floor": gold_metallic_paint(), "walls": models.Lambertian(np.array([0.7, 0.7, 0.68]))}
+    studio = load_map("studio")
+    seen_studio = lambda w: studio.radiance(w)
+    key = jax.random.key(1)
+
+    lobes = {}
+    for name, degree in DEGREES.items():
+        basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+        lobes[name] = shading.tabulate_brdf(brdfs[name], basis, domain="upper", quadrature=64)
+
+    images, truths, rows = {}, {}, []
+    names = [*lights(), "window"]
+    for name in tqdm(names, "lights"):
+        image, truth = np.zeros((len(flat), 3)), np.zeros((len(flat), 3))
+        for surface, mask in surfaces.items():
+            points = [a[mask].astype(np.float32) for a in (positions, normals, -flat)]
+            if name == "window":
+                corners = window()
+                portal = models.PortalLight(corners.astype(np.float32), studio.coefficients(12), DEGREES[surface])
+                shade = lambda *p, portal=portal, s=surface: shading.shade_portal(lobes[s], portal, *p)
+                judge = lambda *p, c=corners, s=surface: reference.shade_polygon(
+                    brdfs[s], c, seen_studio, *p, key=key, samples=samples
+                )
+            else:
+                corners, emission = lights()[name]
+                light = models.PolygonLight(corners.astype(np.float32), emission.astype(np.float32))
+                shade = lambda *p, light=light, s=surface: shading.shade_polygon(lobes[s], light, *p)
+                judge = lambda *p, c=corners, e=emission, s=surface: reference.Estimate(
+                    reference.shade_polygon_quadrature(brdfs[s], c, e, *p, nodes=nodes), np.zeros(1)
+                )
+            image[mask], seconds = timed(shade, *points)
+            start = time.perf_counter()
+            estimate = jax.block_until_ready(judge(*points))
+            reference_seconds = time.perf_counter() - start
+            truth[mask] = estimate.value
+            error, noise = compare(
+                image[mask], truth[mask], np.broadcast_to(estimate.standard_error, truth[mask].shape)
+            )
+            rows.append({
+                "light": name, "surface": surface, "degree": DEGREES[surface], "error": error, "noise": noise,
+                "us/pixel": 1e6 * seconds / mask.sum(), "reference us/pixel": 1e6 * reference_seconds / mask.sum(),
+            })  # fmt: skip
+        images[name], truths[name] = image, truth
+    images["all"], truths["all"] = (sum(x[name] for name in names) for x in (images, truths))
+
+    emitters = {name: (covers(points, flat), emission) for name, (points, emission) in lights().items()}
+    emitters["window"] = covers(window(), flat), np.asarray(studio.radiance(flat.astype(np.float32)))
+    show = lambda values, name: picture(values, {k: v for k, v in emitters.items() if name in (k, "all")}, shape)
+    panels = {}
+    for name in [*names, "all"]:
+        error = np.linalg.norm(images[name] - truths[name], axis=1) / np.linalg.norm(truths[name], axis=1).mean()
+        false = plotting.false_colour(error, limits=(BEST, WORST)).reshape(*shape, 3)
+        panels[name] = show(images[name], name), show(truths[name], name), false
+        io.write_image(output / f"{name}.png", np.concatenate(panels[name], axis=1))
+    sheet(output / "area_lights.png", panels)
+    return rows
+
+
+def picture(values: np.ndarray, emitters: dict, shape: tuple[int, int]) -> np.ndarray:
+    image = values.copy()
+    for covered, emission in emitters.values():
+        image[covered] = np.broadcast_to(emission, image.shape)[covered]
+    return io.tonemap(image.reshape(*shape, 3), exposure=1.6)
+
+
+def sheet(path: Path, panels: dict) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    ink, paper = "#e8e6e3", "#17181b"
+    with pyplot.rc_context({"text.color": ink, "font.size": 9, "axes.edgecolor": ink}):
+        height = 0.9 + 1.78 * len(panels)
+        figure, grid = pyplot.subplots(len(panels), 3, figsize=(8.2, height), facecolor=paper)
+        figure.subplots_adjust(0.05, 0.45 / height, 0.99, 1 - 0.35 / height, 0.02, 0.02)
+        for axes, title in zip(grid[0], ("exact over the outline", "reference", "difference"), strict=True):
+            axes.set_title(title, color=ink)
+        for row, (name, images) in zip(grid, panels.items(), strict=True):
+            row[0].text(-0.03, 0.5, name, rotation=90, ha="right", va="center", transform=row[0].transAxes)
+            for axes, image in zip(row, images, strict=True):
+                axes.set_axis_off()
+                axes.imshow(image, interpolation="nearest")
+        scale = figure.add_axes((0.68, 0.24 / height, 0.3, 0.1 / height))
+        ends = np.log10([BEST, WORST])
+        ramp = plotting.false_colour(np.geomspace(BEST, WORST, 256)[None], limits=(BEST, WORST))
+        scale.imshow(ramp, aspect="auto", extent=(*ends, 0, 1))
+        scale.set_yticks([])
+        scale.set_xticks([-6, -4, -2], ["1e-6", "1e-4", "1e-2"], color=ink, fontsize=7)
+        scale.tick_params(length=0, pad=1)
+        figure.text(0.665, 0.22 / height, "error / mean radiance", ha="right", fontsize=8)
+        figure.savefig(path, dpi=110, facecolor=paper)
+        pyplot.close(figure)
+
+
+def table(rows: list[dict], samples: int, nodes: int) -> str:
+    lines = [
+        "| light | surface | degree | error | noise of the reference | us per pixel | reference, us per pixel |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        noise = f"{r['noise']:.1e}" if r["noise"] else ""
+        times = f"{r['us/pixel']:.2g} | {r['reference us/pixel']:.3g}"
+        lines.append(f"| {r['light']} | {r['surface']} | {r['degree']} | {r['error']:.1e} | {noise} | {times} |")
+    lines.append("")
+    lines.append("Error: RMSE over the RMS of the picture of that light on that surface, RGB, float32. References:")
+    lines.append(f"{nodes} x {nodes} Gauss nodes on each triangle of a light; for the window {samples} samples of the")
+    lines.append(
+        "map itself, noise taken off, so that its error includes that of the map at degree 12. Compiling is in"
+    )
+    lines.append("the times of the reference and not in the others.")
+    return "\n".join(lines)
+
+
+def check(rows: list[dict]) -> None:
+    for r in rows:
+        bound = 0.1 if r["light"] == "window" else 5e-3 if r["surface"] == "floor" else 2e-4
+        assert r["error"] < bound, f"{r['light']} on the {r['surface']}: error {r['error']:.2g}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("output/area_lights"), help="folder for pictures and table")
+    parser.add_argument("--size", type=int, default=192, help="width of a picture in pixels")
+    parser.add_argument("--nodes", type=int, default=16, help="Gauss nodes per side of a triangle, reference of lights")
+    parser.add_argument(
+        "--samples", type=int, default=512, help="Monte Carlo samples per pixel, reference of the window"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
+    options = parser.parse_args(arguments)
+    _scene.prepare_output(options.output, options.overwrite, "area_lights.md", parser)
+    start = time.perf_counter()
+    rows = run(options.output, options.size, options.nodes, options.samples)
+    text = table(rows, options.samples, options.nodes)
+    (options.output / "area_lights.md").write_text(text + "\n")
+    print(text)
+    check(rows)
+    print(f"\n{time.perf_counter() - start:.0f} s, pictures in {options.output}/.")
+
+
+if __name__ == "__main__":
+    main()
