@@ -50,6 +50,25 @@ def test_relight_leaves_foreign_folders_alone(tmp_path):
 
 
 @pytest.mark.slow
+def test_area_lights_writes_pictures_and_a_table(tmp_path):
+    output = tmp_path / "area_lights"
+    command = [ROOT / "examples/area_lights.py", "--output", output, "--size", 24, "--nodes", 12]
+    done = python(*command)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (output / "area_lights.md").read_text() in done.stdout
+    assert {path.stem for path in output.glob("*.png")} == {
+        "area_lights",
+        "square",
+        "triangle",
+        "star",
+        "window",
+        "all",
+    }
+    refused = python(*command)
+    assert refused.returncode != 0 and "exists" in refused.stderr
+
+
+@pytest.mark.slow
 def test_the_code_of_the_readme_runs():
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert blocks
