@@ -49,12 +49,18 @@ _OPERATIONS = 1600  # in one kernel: XLA cuts longer ones up, which makes them s
 
 
 def fold(weights: Float[Array, "k l q"], axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, " p"]:
-    """sum over k and l >= 1 of weights[k, l] I_l(axes[k]) for every polygon. Weights may be shared (q = 1)."""
+    """sum over k and l >= 1 of weights[k, l] l (l+1) I_l(axes[k]) for every polygon. Weights may be shared (q = 1)."""
     if degree == 0:
         return jnp.zeros(v.shape[2:], v.dtype)
     if _edges_at_once(degree) > 0:
         return _fold(weights, axes, v, degree)
-    return _sum_all(moments(axes, v, degree) * jnp.swapaxes(weights, 0, 1)[1:])
+    return _sum_all(moments(axes, v, degree) * _by_degree(weights))
+
+
+def _by_degree(weights: Float[Array, "k l q"]) -> Array:
+    """Weights [l, k, q] of I_l, from l = 1 on."""
+    l = np.arange(1, weights.shape[1])
+    return jnp.swapaxes(weights, 0, 1)[1:] * jnp.asarray(l * (l + 1), weights.dtype)[:, None, None]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
@@ -75,14 +81,13 @@ def _fold(weights: Array, axes: Array, v: Loop, degree: int) -> Float[Array, " p
             c = _reference(arcs.c, d)
             terms = _zonal_terms([_unpack(_Edges, edges[:, e]) for e in range(edges.shape[1])], d, c)
             point, states = c.start(), [t.start() for t in terms]
-            sums, sum_c = [jnp.zeros_like(c.gap) for _ in terms], 0.5 * w[1]
+            sums, sum_c = [jnp.zeros_like(c.gap) for _ in terms], w[1]
             for l in range(2, degree + 1):
                 n = _Factors(*(f[l - 2] for f in factors))
                 states = [t.advance(s, point, n) for t, s in zip(terms, states, strict=True)]
                 point = c.advance(point, n)
-                w_l = n.laplacian * w[l]
-                sums = [x + w_l * s.s for x, s in zip(sums, states, strict=True)]
-                sum_c += w_l * point.r
+                sums = [x + w[l] * s.s for x, s in zip(sums, states, strict=True)]
+                sum_c += w[l] * point.r
             change = dot(share, d) * sum_c + sum(t.along * x for t, x in zip(terms, sums, strict=True))
             return value + change
 
@@ -96,7 +101,7 @@ def _fold(weights: Array, axes: Array, v: Loop, degree: int) -> Float[Array, " p
 
 
 def _edges_at_once(degree: int) -> int:
-    return (_OPERATIONS // degree - 8) // 18  # a step takes 18 operations for each edge, and 8 for all
+    return (_OPERATIONS // degree - 7) // 18  # a step takes 18 operations for each edge, and 7 for all
 
 
 def _fold_jvp(degree, primals, tangents):
@@ -104,10 +109,10 @@ def _fold_jvp(degree, primals, tangents):
     value = _fold(weights, axes, v, degree)
     change = jnp.zeros_like(value)
     if not isinstance(d_weights, SymbolicZero):
-        change += _sum_all(moments(axes, v, degree) * jnp.swapaxes(d_weights, 0, 1)[1:])
+        change += _sum_all(moments(axes, v, degree) * _by_degree(d_weights))
     if not isinstance(d_axes, SymbolicZero):
         turned = jax.jvp(lambda a: moments(a, v, degree), (axes,), (d_axes,))[1]
-        change += _sum_all(turned * jnp.swapaxes(weights, 0, 1)[1:])
+        change += _sum_all(turned * _by_degree(weights))
     if not isinstance(dv, SymbolicZero):
         spans = _spans(v)
         at_vertices = _fold_boundary(weights, axes, spans, degree)
@@ -120,7 +125,7 @@ _fold.defjvp(_fold_jvp, symbolic_zeros=True)
 
 
 def _fold_boundary(weights: Array, axes: Array, spans: Float[Array, "rows e p"], degree: int) -> tuple[Array, Array]:
-    """sum over k and l of weights[k, l] times the integrals of `_at_vertices`, [e, p] each."""
+    """sum over k and l of weights[k, l] l (l+1) times the integrals of `_at_vertices`, [e, p] each."""
     factors = _factors(1, degree, spans.dtype)
     zero = jnp.zeros_like(spans[0, 0])
 
@@ -130,7 +135,8 @@ def _fold_boundary(weights: Array, axes: Array, spans: Float[Array, "rows e p"],
             state, middle, chord = terms.start(), zero, zero
             for l in range(1, degree + 1):
                 state = terms.advance(state, _Factors(*(f[l - 1] for f in factors)))
-                middle, chord = middle + w[l] * state.middle, chord + w[l] * state.chord
+                w_l = l * (l + 1.0) * w[l]
+                middle, chord = middle + w_l * state.middle, chord + w_l * state.chord
             return total[0] + middle, total[1] + chord
 
         return None, _for_axes(axis, (zero, zero), axes, weights)

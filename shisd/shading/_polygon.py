@@ -217,10 +217,11 @@ def _up(v: Loop) -> Float[Array, "3 p"]:
 
 
 def _constant(c: Float[Array, "n p"], v: Loop, solid_angle: Array, axes: Array, degree: int) -> Float[Array, " p"]:
-    """Integrals of expansions, each over its loop: weights lambda_l = (inverse_l)^T c_l on moments about the axes."""
+    """Integrals of expansions, each over its loop: weights (inverse_l)^T c_l on moments about the axes."""
     _, inverse = zonal_inverse(degree, c.dtype)
     bands = [slice(l * l, (l + 1) ** 2) for l in range(degree + 1)]
-    weights = jnp.stack([jnp.asarray(inverse[b].T) @ c[b] for b in bands], axis=1)  # k l p
+    scales = [1 / max(l * (l + 1), 1) for l in range(degree + 1)]  # for `fold`
+    weights = jnp.stack([jnp.asarray(inverse[b].T * s) @ c[b] for b, s in zip(bands, scales, strict=True)], axis=1)
     return c[0] * (solid_angle * np.sqrt(1 / (4 * np.pi))) + _moments.fold(weights, axes, v, degree)
 
 

@@ -15,13 +15,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import least_squares
 
-
-class Estimate(NamedTuple):
-    """A value and one standard deviation of its error."""
-
-    value: jax.Array
-    standard_error: jax.Array
-
+from shisd.harmonics import _sh, _tables
+from shisd.reference import Estimate
 
 # ---- integrals of zonal harmonics, NumPy
 
@@ -50,6 +45,32 @@ def edge_quadrature(polygons: np.ndarray, axes: np.ndarray, degree: int) -> np.n
         along = np.einsum("q,psqk->psk", weights / 2, derivative) * theta[..., None]
         moments.append(np.sum(normals @ d.T * along, axis=1) / (l * (l + 1)))
     return np.stack(moments, axis=-1)
+
+
+def line_coefficients(v: jax.Array, degree: int) -> jax.Array:
+    """Integrals of the basis [p, (L+1)^2] over loops [3, s, p], zero for l = 0: from lines along the edges, no axes.
+
+    y_lm is -1/(l(l+1)) times its Laplacian, so its integral is that of n . grad(r^l y_lm) along the edges over l(l+1);
+    the gradient is three harmonics of degree l-1. On p(t) = a + t (b - a), n ds = (a x b) dt / |p|^2: smooth wherever
+    vertices coincide. Each edge is halved; (L/2) theta + 6 Gauss nodes on each half.
+    """
+    x, w = (jnp.asarray(g, v.dtype) for g in legendre.leggauss(int(0.4 * degree) + 6))
+    end = jnp.roll(v, -1, 1)
+    middle = v + end
+    middle = middle / jnp.sqrt(jnp.sum(middle * middle, axis=0))[None]
+    a, b = jnp.concatenate([v, middle], axis=1), jnp.concatenate([middle, end], axis=1)
+    p = a[:, :, None] + ((x + 1) / 2)[None, None, :, None] * (b - a)[:, :, None]
+    length2 = jnp.sum(p * p, axis=0)
+    y = _sh._basis(jnp.moveaxis(p / jnp.sqrt(length2)[None], 0, -1).reshape(-1, 3), degree - 1)
+    weight = (w / 2)[None, :, None] / length2
+    lines = jnp.einsum("sqpn,sqp,isp->ipn", y.reshape(*length2.shape, -1), weight, jnp.cross(a, b - a, axis=0))
+    lines = jnp.pad(lines, ((0, 0), (0, 0), (0, 2 * degree + 1)))
+    result = jnp.zeros_like(lines[0])
+    for line, terms in zip(lines, _tables.gradient_gather(degree, transpose=False), strict=True):
+        for index, factor in terms:
+            result += jnp.asarray(factor[None], v.dtype) * line[:, index]
+    l = _tables.bands(degree)
+    return result * jnp.asarray(1 / np.maximum(l * (l + 1), 1) * (l > 0), v.dtype)[None]
 
 
 def axial_moments(polygons: np.ndarray, axes: np.ndarray, degree: int, dtype=np.float64) -> np.ndarray:

@@ -17,11 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, models, shading
+from shisd import decomposition, domains, harmonics, models, reference, shading
+from shisd.domains import _moments
+from shisd.domains._integrate import loop_coefficients
+from shisd.domains._polygon import loop_solid_angle
 from shisd.harmonics import _tables
-from tests.bench import equation_22
+from tests.bench import equation_22, native, polygons
 from tests.bench.timing import interleaved
-from tests.truth import scipy_basis
+from tests.truth import scipy_basis, triangle_rule, zonal_moments
 
 POINTS = 10_000
 PIXELS = 128 * 128
@@ -194,26 +197,34 @@ def memory_child(degree):
     print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
 
 
+def random_quads(rng, count, size=0.5, sides=4):
+    """Convex spherical polygons [count, sides, 3], counter-clockwise seen from outside, of angular radius `size`."""
+    z, x = unit(rng.normal(size=(2, count, 1, 3)))
+    x = unit(np.cross(x, z))
+    angle = (np.arange(sides) + rng.uniform(-0.3, 0.3, (count, sides)))[..., None] * (2 * np.pi / sides)
+    return np.cos(size) * z + np.sin(size) * (np.cos(angle) * x + np.sin(angle) * np.cross(z, x))
+
+
+def folded(axes, w):
+    """The library's weighted sum of moments, of tiles [T, 3, S, p] of polygons; `w` [L+1, K] as for the C++."""
+    degree = len(w) - 1
+    l = np.maximum(np.arange(degree + 1), 1)
+    scaled = jnp.asarray((w / (l * (l + 1))[:, None]).T[..., None], jnp.float32)
+    tile = jax.checkpoint(lambda v: _moments.fold(scaled, jnp.asarray(axes), v, degree))
+    return lambda v: jax.lax.map(tile, v).reshape(-1)
+
+
 def bench_polygons(degrees=(8, 20)):
     """Integrals of 2L+1 weighted lobes over 16,384 quads of 0.5 rad, float32, against C++ on one thread (AVX2)."""
-    from shisd.domains import _moments
-    from tests.bench import native, polygons
-
     rng = np.random.default_rng(0)
-    z, x = unit(rng.normal(size=(2, PIXELS, 1, 3)))
-    x = unit(np.cross(x, z))
-    angle = (np.arange(4) + rng.uniform(-0.3, 0.3, (PIXELS, 4)))[..., None] * (np.pi / 2)
-    quads = np.cos(0.5) * z + np.sin(0.5) * (np.cos(angle) * x + np.sin(angle) * np.cross(z, x))
-    quads = quads.astype(np.float32)
+    quads = random_quads(rng, PIXELS).astype(np.float32)
     tiles = jnp.asarray(quads.reshape(-1, 8192, 4, 3).transpose(0, 3, 2, 1))
     rows = []
     for degree in degrees:
         axes = unit(rng.normal(size=(2 * degree + 1, 3))).astype(np.float32)
         w = rng.normal(size=(degree + 1, len(axes))).astype(np.float32)
         w[0] = 0
-        fold = lambda v, axes=axes, w=w, degree=degree: jax.lax.map(
-            jax.checkpoint(lambda tile: _moments.fold(jnp.asarray(w).T[..., None], jnp.asarray(axes), tile, degree)), v
-        ).reshape(-1)
+        fold = folded(axes, w)
         ours = jax.jit(fold)
         gradient = jax.jit(jax.value_and_grad(lambda v, fold=fold: jnp.sum(fold(v))))
         times = interleaved(
@@ -225,7 +236,7 @@ def bench_polygons(degrees=(8, 20)):
             },
             tiles,
         )
-        truth = np.einsum("pkl,lk->p", polygons.edge_quadrature(quads[:64].astype(float), axes, degree), w)
+        truth = np.array([np.sum(w * zonal_moments(q, axes, degree, 30).T) for q in quads[:64]])
         error = lambda got, truth=truth: float(np.max(np.abs(np.asarray(got)[:64] - truth)) / np.max(np.abs(truth)))
         rows.append({
             "degree": degree,
@@ -240,13 +251,161 @@ def bench_polygons(degrees=(8, 20)):
     return rows
 
 
+def bench_polygon_degree(degrees=(8, 12, 16, 24, 32, 48, 64)):
+    """Cost of one integral over a triangle against the number of coefficients (L+1)^2, float32; 2L+1 lobes."""
+    rng = np.random.default_rng(0)
+    tiles = jnp.asarray(random_quads(rng, PIXELS, sides=3).reshape(-1, 8192, 3, 3).transpose(0, 3, 2, 1), jnp.float32)
+    functions = {}
+    for degree in degrees:
+        axes = unit(rng.normal(size=(2 * degree + 1, 3))).astype(np.float32)
+        functions[degree] = jax.jit(folded(axes, rng.normal(size=(degree + 1, len(axes)))))
+    times = interleaved(functions, tiles)
+    cost = {degree: times[degree].median / PIXELS * 1e6 for degree in degrees}
+    return [
+        {
+            "degree": degree,
+            "coefficients": (degree + 1) ** 2,
+            "us/triangle": us,
+            "ns per coefficient": 1e3 * us / (degree + 1) ** 2,
+            "first call s": times[degree].first,
+        }
+        for degree, us in cost.items()
+    ]
+
+
+def bench_moments(degrees=(4, 8, 12, 16, 20, 30, 40, 60, 100)):
+    """Error over solid angle of the moments of P_l over 8 quads at 9 random axes: cosine powers, zonal moments."""
+    rows = []
+    for size in (0.5, 0.06):
+        rng = np.random.default_rng(1)
+        quads, axes = random_quads(rng, 8, size), unit(rng.normal(size=(9, 3)))
+        for degree in degrees:
+            row = {"size rad": size, "degree": degree}
+            for dtype in (np.float32, np.float64):
+                v, d = quads.astype(dtype), axes.astype(dtype)
+                truth = np.stack([zonal_moments(q, d, degree, 20 + degree // 2) for q in v])
+                scale = truth[:, :1, 0]
+                with jax.enable_x64(dtype == np.float64):
+                    moments = jax.vmap(
+                        lambda q, d=d, l=degree: domains.zonal_moments(domains.SphericalPolygon(q), d, l)
+                    )
+                    ours = np.asarray(moments(jnp.asarray(v)))
+                powers = polygons.zonal_from_axial(polygons.axial_moments(v, d, degree, dtype))
+                error = lambda got, t=truth, s=scale: float(np.max(np.abs(got[..., -1] - t[..., -1]) / s))
+                row |= {f"cosine powers, {dtype.__name__}": error(powers), f"zonal, {dtype.__name__}": error(ours)}
+            rows.append(row)
+    return rows
+
+
+def bench_coefficients(degrees=(8, 20, 40)):
+    """All integrals of the basis over a quad of 0.5 rad, float32: zonal moments about axes, or lines without axes."""
+    rng = np.random.default_rng(0)
+    quads = random_quads(rng, 4096).astype(np.float32)
+    tiles = jnp.asarray(quads.reshape(-1, 64, 4, 3).transpose(0, 3, 2, 1))
+    rows = []
+    for degree in degrees:
+        zonal = lambda v, degree=degree: loop_coefficients(v, loop_solid_angle(v, 2 * np.pi), degree).T
+        routes = {"zonal": zonal, "lines": lambda v, degree=degree: polygons.line_coefficients(v, degree)}
+        routes = {name: jax.jit(lambda v, f=f: jax.lax.map(f, v)) for name, f in routes.items()}
+        times = interleaved(routes, tiles)
+        points = [triangle_rule(q, 24) for q in quads[:4]]
+        truth = np.stack([area.astype(float) @ scipy_basis(w.astype(float), degree) for w, area in points])
+        error = lambda got, t=truth: float(np.max(np.abs(got[0, :4, 1:] - t[:, 1:]) / t[:, :1]) / np.sqrt(4 * np.pi))
+        rows.append({
+            "degree": degree,
+            "us/quad": times["zonal"].median / len(quads) * 1e6,
+            "time of lines / zonal": times["lines"].median / times["zonal"].median,
+            "error / solid angle": error(np.asarray(routes["zonal"](tiles))),
+            "of lines": error(np.asarray(routes["lines"](tiles))),
+        })  # fmt: skip
+    return rows
+
+
+def bench_polygon_light(count=4096):
+    """Radiance from a quad above a floor, float32: lobes over the quad, Monte Carlo, linearly transformed cosines."""
+    rng = np.random.default_rng(0)
+    quad = np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]], np.float32)
+    position = (rng.uniform(-2, 2, (count, 3)) * [1, 1, 0]).astype(np.float32)
+    view = unit(rng.normal(size=(count, 3)) * [1, 1, 0.5] + [0, 0, 1.2]).astype(np.float32)
+    view[:, 2] = np.abs(view[:, 2])
+    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), view.shape)
+    local = jnp.asarray(quad[None] - position[:, None])
+    rows = []
+    for name, make in {
+        "Lambertian": lambda: models.Lambertian(0.8),
+        "GGX 0.5": lambda: models.Ggx(0.5, 0.04),
+        "GGX 0.25": lambda: models.Ggx(0.25, 0.04),
+    }.items():
+        with jax.enable_x64(True):
+            few = [np.asarray(x[:256], float) for x in (position, normal, view)]
+            truth = np.asarray(reference.shade_polygon_quadrature(make(), quad.astype(float), 1.0, *few, nodes=48))
+        brdf, key = make(), jax.random.key(0)
+        methods = {}
+        for degree in (4, 8, 20):
+            basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+            lobes = shading.tabulate_brdf(brdf, basis, domain="upper")
+            shade = lambda p, v, lobes=lobes: shading.shade_polygon(lobes, models.PolygonLight(quad), p, normal, v)
+            methods[f"lobes, degree {degree}"] = shade
+        for samples in (16, 256):
+            for kind, estimate in (
+                ("area", polygons.monte_carlo_area),
+                ("solid angle", polygons.monte_carlo_solid_angle),
+            ):
+                methods[f"{samples} samples by {kind}"] = lambda p, v, e=estimate, n=samples, b=brdf, k=key: (
+                    e(b, local, v, key=k, samples=n).value
+                )
+        transformed = polygons.fit_ltc(brdf)
+        methods["transformed cosines"] = lambda p, v, t=transformed: polygons.ltc_radiance(t, local, v)
+        times = interleaved(methods, jnp.asarray(position), jnp.asarray(view))
+        for method, shade in methods.items():
+            error = np.asarray(shade(jnp.asarray(position), jnp.asarray(view)))[:256] - truth
+            rows.append({
+                "material": name,
+                "method": method,
+                "us/pixel": times[method].median / count * 1e6,
+                "relative RMSE": float(np.sqrt(np.mean(error**2) / np.mean(truth**2))),
+                "max error / max": float(np.max(np.abs(error)) / np.max(truth)),
+                "first call s": times[method].first,
+            })  # fmt: skip
+    return rows
+
+
+def cost_figure(rows, path):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    n, us = np.array([r["coefficients"] for r in rows]), np.array([r["us/triangle"] for r in rows])
+    figure, axes = pyplot.subplots(figsize=(5.5, 3.4))
+    axes.loglog(n, us, "o-", label="measured")
+    axes.loglog(n, us[-1] * n / n[-1], "k:", label="in proportion")
+    for r in rows:
+        axes.annotate(
+            f"degree {r['degree']}",
+            (r["coefficients"], r["us/triangle"]),
+            (4, -11),
+            textcoords="offset points",
+            fontsize=7,
+        )
+    axes.set(xlabel="coefficients $(L+1)^2$", ylabel="us per triangle", title="Cost of one integral over a triangle")
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+
+
 BENCHES = {
     "basis": bench_basis,
     "evaluate": bench_evaluate,
     "project_map": bench_project_map,
     "equation_22": bench_equation_22,
     "memory": bench_memory,
+    "moments": bench_moments,
     "polygons": bench_polygons,
+    "polygon_degree": bench_polygon_degree,
+    "coefficients": bench_coefficients,
+    "polygon_light": bench_polygon_light,
 }
 
 
@@ -281,6 +440,8 @@ def main():
         results[name] = BENCHES[name]()
         sections.append(f"{BENCHES[name].__doc__}\n\n{table(results[name])}")
         print(sections[-1], "\n", flush=True)
+        if name == "polygon_degree":
+            cost_figure(results[name], arguments.output / "polygon_cost.png")
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."

@@ -11,6 +11,7 @@ from scipy.special import eval_legendre
 
 from shisd import models
 from tests.bench import native, polygons
+from tests.truth import scipy_basis
 
 pytestmark = pytest.mark.slow  # the baselines of benchmarks, not the library
 
@@ -153,6 +154,13 @@ def test_axial_moments_are_right_and_lose_their_digits(rng):
     assert error(np.float32, 8) < 1e-3, error(np.float32, 8)
     assert error(np.float32, 20) > 0.3, error(np.float32, 20)
     assert error(np.float64, 40) > 0.03, error(np.float64, 40)
+
+
+def test_lines_without_axes_give_the_integrals_of_the_basis(x64, rng):
+    v = spherical_polygons(rng, 3, 5, 0.6)
+    got = polygons.line_coefficients(jnp.asarray(v.transpose(2, 1, 0)), 12)
+    expected = [over_area(p, lambda w: scipy_basis(w, 12)) for p in v]
+    np.testing.assert_allclose(got[:, 1:], np.stack(expected)[:, 1:], atol=1e-12)
 
 
 # ---- radiance
