@@ -442,6 +442,8 @@ def main():
         print(sections[-1], "\n", flush=True)
         if name == "polygon_degree":
             cost_figure(results[name], arguments.output / "polygon_cost.png")
+            if arguments.readme:
+                cost_figure(results[name], Path("examples/polygon_cost.png"))
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
