@@ -21,6 +21,15 @@ from shisd.reference import Estimate
 # ---- integrals of zonal harmonics, NumPy
 
 
+def spherical_polygons(rng, count: int, sides: int, size: float) -> np.ndarray:
+    """Convex polygons [count, sides, 3], counter-clockwise seen from outside, of angular radius `size`."""
+    unit = lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True)
+    z, x = unit(rng.normal(size=(2, count, 1, 3)))
+    x = unit(np.cross(x, z))
+    angle = 2 * np.pi * (np.arange(sides) + rng.uniform(-0.3, 0.3, (count, sides)))[..., None] / sides
+    return np.cos(size) * z + np.sin(size) * (np.cos(angle) * x + np.sin(angle) * np.cross(z, x))
+
+
 def solid_angles(polygons: np.ndarray) -> np.ndarray:
     """Solid angles [P] in sr, by a fan of triangles (van Oosterom and Strackee 1983); the dtype is the input's."""
     a, b, c = polygons[:, :1], polygons[:, 1:-1], polygons[:, 2:]

@@ -197,14 +197,6 @@ def memory_child(degree):
     print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
 
 
-def random_quads(rng, count, size=0.5, sides=4):
-    """Convex spherical polygons [count, sides, 3], counter-clockwise seen from outside, of angular radius `size`."""
-    z, x = unit(rng.normal(size=(2, count, 1, 3)))
-    x = unit(np.cross(x, z))
-    angle = (np.arange(sides) + rng.uniform(-0.3, 0.3, (count, sides)))[..., None] * (2 * np.pi / sides)
-    return np.cos(size) * z + np.sin(size) * (np.cos(angle) * x + np.sin(angle) * np.cross(z, x))
-
-
 def folded(axes, w):
     """The library's weighted sum of moments, of tiles [T, 3, S, p] of polygons; `w` [L+1, K] as for the C++."""
     degree = len(w) - 1
@@ -217,7 +209,7 @@ def folded(axes, w):
 def bench_polygons(degrees=(8, 20)):
     """Integrals of 2L+1 weighted lobes over 16,384 quads of 0.5 rad, float32, against C++ on one thread (AVX2)."""
     rng = np.random.default_rng(0)
-    quads = random_quads(rng, PIXELS).astype(np.float32)
+    quads = polygons.spherical_polygons(rng, PIXELS, 4, 0.5).astype(np.float32)
     tiles = jnp.asarray(quads.reshape(-1, 8192, 4, 3).transpose(0, 3, 2, 1))
     rows = []
     for degree in degrees:
@@ -254,7 +246,9 @@ def bench_polygons(degrees=(8, 20)):
 def bench_polygon_degree(degrees=(8, 12, 16, 24, 32, 48, 64)):
     """Cost of one integral over a triangle against the number of coefficients (L+1)^2, float32; 2L+1 lobes."""
     rng = np.random.default_rng(0)
-    tiles = jnp.asarray(random_quads(rng, PIXELS, sides=3).reshape(-1, 8192, 3, 3).transpose(0, 3, 2, 1), jnp.float32)
+    tiles = jnp.asarray(
+        polygons.spherical_polygons(rng, PIXELS, 3, 0.5).reshape(-1, 8192, 3, 3).transpose(0, 3, 2, 1), jnp.float32
+    )
     functions = {}
     for degree in degrees:
         axes = unit(rng.normal(size=(2 * degree + 1, 3))).astype(np.float32)
@@ -278,7 +272,7 @@ def bench_moments(degrees=(4, 8, 12, 16, 20, 30, 40, 60, 100)):
     rows = []
     for size in (0.5, 0.06):
         rng = np.random.default_rng(1)
-        quads, axes = random_quads(rng, 8, size), unit(rng.normal(size=(9, 3)))
+        quads, axes = polygons.spherical_polygons(rng, 8, 4, size), unit(rng.normal(size=(9, 3)))
         for degree in degrees:
             row = {"size rad": size, "degree": degree}
             for dtype in (np.float32, np.float64):
@@ -300,7 +294,7 @@ def bench_moments(degrees=(4, 8, 12, 16, 20, 30, 40, 60, 100)):
 def bench_coefficients(degrees=(8, 20, 40)):
     """All integrals of the basis over a quad of 0.5 rad, float32: zonal moments about axes, or lines without axes."""
     rng = np.random.default_rng(0)
-    quads = random_quads(rng, 4096).astype(np.float32)
+    quads = polygons.spherical_polygons(rng, 4096, 4, 0.5).astype(np.float32)
     tiles = jnp.asarray(quads.reshape(-1, 64, 4, 3).transpose(0, 3, 2, 1))
     rows = []
     for degree in degrees:

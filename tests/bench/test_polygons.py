@@ -20,17 +20,9 @@ def unit(x):
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
-def spherical_polygons(rng, count, sides, size):
-    """Convex, counterclockwise seen from outside, of angular radius `size`."""
-    z, x = unit(rng.normal(size=(2, count, 1, 3)))
-    x = unit(np.cross(x, z))
-    angle = 2 * np.pi * (np.arange(sides) + rng.uniform(-0.3, 0.3, (count, sides)))[..., None] / sides
-    return np.cos(size) * z + np.sin(size) * (np.cos(angle) * x + np.sin(angle) * np.cross(z, x))
-
-
 def planar_polygons(rng, count, height, sides=4, radius=0.8):
     """Convex, about points at `height`, facing the origin."""
-    points = spherical_polygons(rng, count, sides, 1.0)
+    points = polygons.spherical_polygons(rng, count, sides, 1.0)
     flat = unit(points - points.mean(axis=1, keepdims=True)) * radius
     centre = np.concatenate([rng.uniform(-1, 1, (count, 2)), np.full((count, 1), height)], axis=-1)
     return flat + centre[:, None]
@@ -74,7 +66,7 @@ def sigmas(estimate, truth):
 
 @pytest.mark.parametrize("sides", [3, 4, 6])
 def test_the_edge_formula_is_the_integral_over_the_area(rng, sides):
-    v, d = spherical_polygons(rng, 3, sides, 0.6), unit(rng.normal(size=(5, 3)))
+    v, d = polygons.spherical_polygons(rng, 3, sides, 0.6), unit(rng.normal(size=(5, 3)))
     values = polygons.edge_quadrature(v, d, 20)
     for polygon, value in zip(v, values, strict=True):
         truth = over_area(polygon, lambda w: eval_legendre(np.arange(21), (w @ d.T)[..., None]))
@@ -90,7 +82,7 @@ needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="no g++"
     ("degree", "sides", "size"), [(1, 4, 0.5), (2, 3, 1.5), (7, 5, 1.0), (8, 4, 0.2), (20, 4, 1.2)]
 )
 def test_native_code_matches_quadrature(rng, difference, degree, sides, size):
-    v = spherical_polygons(rng, 37, sides, size).astype(np.float32)
+    v = polygons.spherical_polygons(rng, 37, sides, size).astype(np.float32)
     d = unit(rng.normal(size=(2 * degree + 1, 3))).astype(np.float32)
     d[0], d[1], d[2] = v[0, 0], -v[0, 1], unit(np.cross(v[0, 0], v[0, 1]))
     v[1, 1] = v[1, 0]  # an edge of no length
@@ -104,7 +96,7 @@ def test_native_code_matches_quadrature(rng, difference, degree, sides, size):
 @needs_compiler
 @pytest.mark.parametrize("difference", [False, True])
 def test_native_code_in_sixteen_lanes_and_one_degree_at_a_time(rng, difference):
-    v, d = spherical_polygons(rng, 20, 4, 0.9), unit(rng.normal(size=(3, 3)))
+    v, d = polygons.spherical_polygons(rng, 20, 4, 0.9), unit(rng.normal(size=(3, 3)))
     truth = polygons.edge_quadrature(v, d, 9)
     for l in range(1, 10):
         weights = np.zeros((10, 3))
@@ -116,7 +108,7 @@ def test_native_code_in_sixteen_lanes_and_one_degree_at_a_time(rng, difference):
 
 @needs_compiler
 def test_the_difference_form_keeps_the_digits_of_small_polygons(rng):
-    v = spherical_polygons(rng, 64, 4, 0.01).astype(np.float32)
+    v = polygons.spherical_polygons(rng, 64, 4, 0.01).astype(np.float32)
     d, weights = unit(rng.normal(size=(17, 3))).astype(np.float32), rng.normal(size=(9, 17)).astype(np.float32)
     truth = np.einsum("pkl,lk->p", polygons.edge_quadrature(unit(v.astype(float)), d, 8)[..., 1:], weights[1:])
     error = lambda difference: np.max(np.abs(native.polygon_moments(v, d, weights, difference=difference) - truth))
@@ -139,7 +131,7 @@ def test_native_code_says_what_is_missing(monkeypatch):
 
 
 def test_axial_moments_are_right_and_lose_their_digits(rng):
-    v, d = spherical_polygons(rng, 10, 4, 0.5), unit(rng.normal(size=(41, 3)))
+    v, d = polygons.spherical_polygons(rng, 10, 4, 0.5), unit(rng.normal(size=(41, 3)))
     truth = over_area(v[0], lambda w: (w @ d.T)[..., None] ** np.arange(6))
     np.testing.assert_allclose(polygons.axial_moments(v[:1], d, 5)[0], truth, atol=1e-12)
     truth = polygons.edge_quadrature(v, d, 40)
@@ -157,7 +149,7 @@ def test_axial_moments_are_right_and_lose_their_digits(rng):
 
 
 def test_lines_without_axes_give_the_integrals_of_the_basis(x64, rng):
-    v = spherical_polygons(rng, 3, 5, 0.6)
+    v = polygons.spherical_polygons(rng, 3, 5, 0.6)
     got = polygons.line_coefficients(jnp.asarray(v.transpose(2, 1, 0)), 12)
     expected = [over_area(p, lambda w: scipy_basis(w, 12)) for p in v]
     np.testing.assert_allclose(got[:, 1:], np.stack(expected)[:, 1:], atol=1e-12)

@@ -96,6 +96,17 @@ def test_a_whole_and_its_parts(dtype, rng):
     np.testing.assert_allclose(m(np.roll(v, 1, axis=0)), m(v), atol=tolerance)
 
 
+def test_the_outside_of_a_polygon(dtype, rng):
+    """More than a hemisphere: reversed, it is the sphere without the polygon."""
+    v = random_polygon(rng, 4, 0.7).astype(dtype)
+    axes = unit(rng.normal(size=(5, 3))).astype(dtype)
+    inside = domains.zonal_moments(domains.SphericalPolygon(padded(v)), axes, 20)
+    outside = domains.zonal_moments(domains.SphericalPolygon(padded(v[::-1]), largest=4 * np.pi), axes, 20)
+    whole = 4 * np.pi * np.eye(21)[0]
+    tolerance = {"float64": 1e-13, "float32": 2e-5}[dtype.name]
+    np.testing.assert_allclose(np.asarray(inside) + np.asarray(outside), np.tile(whole, (5, 1)), atol=tolerance)
+
+
 def test_the_octants_cover_the_sphere(dtype):
     """Zero for l > 0, and 4 pi, whatever the axis; every edge is a quarter circle."""
     axes = unit([[0, 0, 1], [1, 2, 3], [-1, 0.5, 0]]).astype(dtype)

@@ -96,15 +96,39 @@ def test_exact_for_the_tabulated_slice(dtype, rng):
     np.testing.assert_allclose(got, expected, atol=tolerance * np.max(expected))
 
 
-def expected_radiance(lobes, light, position, normal, view):
+def expected_radiance(lobes, light, position, normal, view, points=QUAD):
     """The clipped integral of the interpolated slice times light(world directions) [N, colour], SciPy's harmonics."""
     radiance = []
     for p, n, v in zip(position, normal, view, strict=True):
-        _, frame = local_outline(QUAD, p, n)
+        _, frame = local_outline(points, p, n)
         c = np.asarray(lobes.slice_coefficients(jnp.asarray(frame @ v, lobes.weights.dtype)), float)
         values = lambda w, frame, c=c: (truth.scipy_basis(w, 4) @ c)[:, None] * light(w @ frame)
-        radiance.append(quadrature(values, QUAD, p, n) * np.ones(3))
+        radiance.append(quadrature(values, points, p, n) * np.ones(3))
     return np.stack(radiance)
+
+
+HARD = {
+    "1e-4 away": [[-0.5, -0.5, 1e-4], [-0.5, 0.5, 1e-4], [0.5, 0.5, 1e-4], [0.5, -0.5, 1e-4]],
+    "an edge on the horizon": [[1, -0.4, 0], [1.2, -0.4, 0.8], [1.1, 0.5, 0.9], [1, 0.5, 0]],
+    "a corner on the horizon": [[1, 0, 0], [1.2, -0.4, 0.8], [1.1, 0.2, 0.9], [1, 0.5, 0.3]],
+    "across the horizon, turning inwards": [[1, -1, -0.3], [1, 0, 0.8], [1, 0.2, -0.4], [1, 0.4, 0.7], [1, 1, -0.2]],
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_cases(name, dtype):
+    """Values against quadrature, gradients against those of a light that is moved a little."""
+    points = np.asarray(HARD[name], dtype)
+    lobes, up = lobes_of("glossy", 4, dtype.name), np.asarray([[0, 0, 1]], dtype)
+    view = unit([[0.4, -0.3, 0.6]]).astype(dtype)
+    shade = jax.jit(lambda q: shading.shade_polygon(lobes, models.PolygonLight(q, two_sided=True), 0 * up, up, view)[0])
+    expected = expected_radiance(lobes, lambda w: 1, 0 * up, up, view, points.astype(float))[0, 0]
+    np.testing.assert_allclose(shade(points), expected, rtol={"float64": 1e-11, "float32": 1e-4}[dtype.name])
+    if dtype == np.float64:
+        lift = np.asarray([0, 0, 1e-11 if name == "1e-4 away" else -1e-7])  # what is on the horizon counts as cut
+        gradient = jax.grad(shade)
+        scale = np.max(np.abs(gradient(points)))
+        np.testing.assert_allclose(gradient(points), gradient(points + lift), atol=2e-5 * scale)
 
 
 def test_light_by_direction(dtype, rng):
