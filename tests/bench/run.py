@@ -315,14 +315,22 @@ def bench_coefficients(degrees=(8, 20, 40)):
     return rows
 
 
-def bench_polygon_light(count=4096):
-    """Radiance from a quad above a floor, float32: lobes over the quad, Monte Carlo, linearly transformed cosines."""
+POLYGON_LIGHT = np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]], np.float32)
+
+
+def polygon_light_points(count):
+    """Positions on a floor below the light, views from above, and normals, [count, 3] each."""
     rng = np.random.default_rng(0)
-    quad = np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]], np.float32)
     position = (rng.uniform(-2, 2, (count, 3)) * [1, 1, 0]).astype(np.float32)
     view = unit(rng.normal(size=(count, 3)) * [1, 1, 0.5] + [0, 0, 1.2]).astype(np.float32)
     view[:, 2] = np.abs(view[:, 2])
-    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), view.shape)
+    return position, view, np.broadcast_to(np.array([0, 0, 1], np.float32), view.shape)
+
+
+def bench_polygon_light(count=4096):
+    """Radiance from a quad above a floor, float32: lobes over the quad, Monte Carlo, linearly transformed cosines."""
+    position, view, normal = polygon_light_points(count)
+    quad = POLYGON_LIGHT
     local = jnp.asarray(quad[None] - position[:, None])
     rows = []
     for name, make in {
@@ -364,6 +372,28 @@ def bench_polygon_light(count=4096):
     return rows
 
 
+def bench_ridge(ridges=(1e-2, 1e-4, 1e-6, 1e-8, 1e-10), degree=8, count=64):
+    """Relative RMSE of lobes fitted above the horizon against the ridge of the fit, at degree 8; the same light."""
+    position, view, normal = polygon_light_points(count)
+    quad = POLYGON_LIGHT.astype(float)
+    rows = [{"ridge": ridge} for ridge in ridges]
+    for name, make in {"Lambertian": lambda: models.Lambertian(0.8), "GGX 0.5": lambda: models.Ggx(0.5, 0.04)}.items():
+        for dtype in (np.float32, np.float64):
+            points = [x.astype(dtype) for x in (position, normal, view)]
+            with jax.enable_x64(True):
+                exact = [x.astype(float) for x in points]
+                truth = np.asarray(reference.shade_polygon_quadrature(make(), quad, 1.0, *exact, nodes=48))
+            with jax.enable_x64(dtype == np.float64):
+                axes = decomposition.optimized_directions(degree, dtype=dtype)
+                basis = decomposition.RotatedZonalBasis(axes, degree)
+                light = models.PolygonLight(quad.astype(dtype))
+                for row in rows:
+                    lobes = shading.tabulate_brdf(make(), basis, domain="upper", ridge=row["ridge"])
+                    error = np.asarray(shading.shade_polygon(lobes, light, *points)) - truth
+                    row[f"{name}, {dtype.__name__}"] = float(np.sqrt(np.mean(error**2) / np.mean(truth**2)))
+    return rows
+
+
 def cost_figure(rows, path):
     import matplotlib
 
@@ -400,6 +430,7 @@ BENCHES = {
     "polygon_degree": bench_polygon_degree,
     "coefficients": bench_coefficients,
     "polygon_light": bench_polygon_light,
+    "ridge": bench_ridge,
 }
 
 
