@@ -105,7 +105,6 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
     outside = models.Environment(np.roll(outside.texels, 240, axis=1))  # bright panes towards the window
     coefficients = np.asarray(outside.coefficients(12))
     expansion = lambda w: harmonics.evaluate(coefficients, w[:, None])
-    map_itself = lambda w: outside.radiance(w)
 
     lobes = {}
     for name, degree in DEGREES.items():
@@ -136,7 +135,7 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
             row["us/pixel"], row["reference us/pixel"] = (1e6 * t / mask.sum() for t in (seconds, reference_seconds))
             if name == "window":
                 some = np.random.default_rng(0).choice(mask.sum(), 128)
-                exact = np.asarray(judge(map_itself, *(a[some] for a in points), nodes=8 * nodes))
+                exact = np.asarray(judge(outside.radiance, *(a[some] for a in points), nodes=8 * nodes))
                 row["error to the map"] = relative(image[mask][some], exact)
             rows.append(row)
         images[name], truths[name] = image, truth
@@ -221,9 +220,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("output/area_lights"), help="folder for pictures and table")
     parser.add_argument("--size", type=int, default=192, help="width of a picture in pixels")
     parser.add_argument("--nodes", type=int, default=16, help="Gauss nodes along each side of a triangle")
-    parser.add_argument(
-        "--samples", type=int, default=512, help="Monte Carlo samples per pixel, reference of the window"
-    )
     parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
     options = parser.parse_args(arguments)
     _scene.prepare_output(options.output, options.overwrite, "area_lights.md", parser)

@@ -46,10 +46,23 @@ def coefficients(name: str, value: ArrayLike) -> tuple[Array, int]:
     """`value` as floating SH coefficients [..., (L+1)^2], and the degree L."""
     array = real_array(name, value)
     size = array.shape[-1] if array.ndim else 0
-    degree = math.isqrt(size) - 1
+    degree = degree_of(size)
     if degree < 0 or (degree + 1) ** 2 != size:
         raise ValueError(f"`{name}` must have (degree + 1)**2 coefficients on its last axis; got {list(array.shape)}.")
     return array, degree
+
+
+def degree_of(size: int) -> int:
+    """The degree L of (L+1)^2 coefficients."""
+    return math.isqrt(size) - 1
+
+
+def outline(name: str, value: ArrayLike) -> Array:
+    """`value` as the floating points [S, 3] of a polygon."""
+    array = vectors(name, value)
+    if array.ndim != 2 or array.shape[0] < 3:
+        raise ValueError(f"`{name}` must have shape [S, 3] with at least 3 points; got {list(array.shape)}.")
+    return array
 
 
 def integer(name: str, value: object, minimum: int = 0) -> int:

@@ -52,6 +52,12 @@ def cross(a: Vector, b: Vector) -> Array:
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+def times(a: Array, b: Array) -> Array:
+    """Products of arrays whose axes broadcast from the last one, whatever their number."""
+    shape = jnp.broadcast_shapes(a.shape, b.shape)
+    return jnp.broadcast_to(a, shape) * jnp.broadcast_to(b, shape)
+
+
 def safe_sqrt(x: Array) -> Array:
     """Square roots whose derivative at 0 is 0, not infinite."""
     positive = x > 0

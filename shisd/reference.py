@@ -123,7 +123,7 @@ def shade_polygon_quadrature(
 
     Converges exponentially for smooth materials and radiance: compare two settings of `nodes`. In float64 it reaches
     rounding; a light that is closer than its size, or a lobe that is narrow, needs more nodes.
-    Cost: (S + S // 2) nodes^2 evaluations per point, one point in memory at a time: for a few points.
+    Cost: 2 S nodes^2 evaluations per point, one point in memory at a time: for a few points.
     """
     nodes = _checks.integer("nodes", nodes, minimum=1)
     frames, local_views = _frames(normals, views, tangents, brdf)
@@ -163,11 +163,17 @@ def _times(brdf_values: Array, radiance: Array, lead: int) -> Array:
     return pad(brdf_values) * pad(radiance)
 
 
-def _integrand(brdf: AbstractBrdf, environment: Environment, frame: Array, wo: Array, wi: Array) -> Array:
+def _integrand(brdf: AbstractBrdf, radiance: Radiance, frame: Array, wo: Array, wi: Array) -> Array:
     """value_cosine times radiance [..., *colour] at local directions [..., 3]; 0 when the view is below the horizon."""
     values = jax.vmap(lambda w: brdf.value_cosine(w, wo))(wi.reshape(-1, 3))
     values = values.reshape(wi.shape[:-1] + values.shape[1:])
-    product = _times(values, environment.radiance(wi @ frame), wi.ndim - 1)
+    lead = wi.ndim - 1
+    if callable(radiance):
+        light = jnp.asarray(radiance(wi @ frame))
+    else:
+        light = jnp.asarray(radiance, values.dtype)
+        light = light.reshape((1,) * lead + light.shape)
+    product = _times(values, light, lead)
     return jnp.where(wo[2] > 0, product, jnp.zeros_like(product))
 
 
@@ -298,7 +304,7 @@ def _monte_carlo(
         density = sizes[0] * light(wi @ frame) + sizes[1] / np.pi * jnp.maximum(wi[..., 2], 0)
         density += sizes[2] * _ggx_density(wi, wo, alpha)
         inverse = jnp.where(density > 0, 1 / jnp.where(density > 0, density, jnp.ones_like(density)), 0)
-        terms = _times(inverse, _integrand(brdf, environment, frame, wo, wi), 2)
+        terms = _times(inverse, _integrand(brdf, environment.radiance, frame, wo, wi), 2)
         value = jnp.sum(terms, axis=(0, 1))
         return value, jnp.sqrt(jnp.sum((terms[0] - terms[1]) ** 2, axis=0))
 
@@ -333,7 +339,7 @@ def _quadrature(brdf: AbstractBrdf, environment: Environment, frames: Array, vie
         def row(part: tuple[Array, Array, Array]) -> Array:
             cosine, sine, solid_angle = part
             world = jnp.concatenate([sine * circle, jnp.full_like(circle[:, :1], cosine)], axis=1)
-            return solid_angle * jnp.sum(_integrand(brdf, environment, frame, wo, world @ frame.T), axis=0)
+            return solid_angle * jnp.sum(_integrand(brdf, environment.radiance, frame, wo, world @ frame.T), axis=0)
 
         return jnp.sum(jax.lax.map(row, (cosines, sines, solid_angles)), axis=0)
 
@@ -344,9 +350,7 @@ def _quadrature(brdf: AbstractBrdf, environment: Environment, frames: Array, vie
 
 
 def _polygon_points(points: ArrayLike, positions: ArrayLike, frames: Array) -> tuple[Array, Array]:
-    corners, where = _checks.vectors("points", points), _checks.vectors("positions", positions)
-    if corners.ndim != 2 or corners.shape[0] < 3:
-        raise ValueError(f"`points` must have shape [S, 3] with at least 3 points; got {list(corners.shape)}.")
+    corners, where = _checks.outline("points", points), _checks.vectors("positions", positions)
     if where.shape != (frames.shape[0], 3):
         raise ValueError(f"`positions` must have the shape of `normals`, [N, 3]; got {list(where.shape)}.")
     return corners.astype(frames.dtype), where.astype(frames.dtype)
@@ -359,14 +363,6 @@ def _faces(corners: Array, two_sided: bool, where: Array) -> tuple[Array, Array]
     normal /= jnp.sqrt(jnp.sum(normal * normal))
     side = jnp.dot(where - corners[0], normal)
     return normal, (side != 0) & two_sided | (side > 0)
-
-
-def _arriving(brdf: AbstractBrdf, radiance: Radiance, frame: Array, wo: Array, wi: Array) -> Array:
-    """value_cosine times radiance [M, *colour] at local directions [M, 3]; 0 when the view is below the horizon."""
-    values = jax.vmap(lambda w: brdf.value_cosine(w, wo))(wi)
-    light = jnp.asarray(radiance(wi @ frame)) if callable(radiance) else jnp.asarray(radiance)[None]
-    product = _times(values, light.astype(values.dtype), 1)
-    return jnp.where(wo[2] > 0, product, jnp.zeros_like(product))
 
 
 @eqx.filter_jit
@@ -390,7 +386,7 @@ def _polygon_monte_carlo(
         distance2 = jnp.sum(offset * offset, axis=1)
         wi = offset / jnp.sqrt(distance2)[:, None]
         weight = jnp.sign(signed)[index].reshape(-1) * jnp.sum(jnp.abs(signed)) * jnp.abs(wi @ normal) / distance2
-        terms = _times(jnp.where(seen, weight, 0), _arriving(brdf, radiance, frame, wo, wi @ frame.T), 1)
+        terms = _times(jnp.where(seen, weight, 0), _integrand(brdf, radiance, frame, wo, wi @ frame.T), 1)
         terms = terms.reshape(2, -1, *terms.shape[1:]) / index.size
         return jnp.sum(terms, axis=(0, 1)), jnp.sqrt(jnp.sum((terms[0] - terms[1]) ** 2, axis=0))
 
@@ -430,7 +426,7 @@ def _polygon_quadrature(
             distance2 = jnp.sum(offset * offset, axis=1)
             wi = offset / jnp.sqrt(distance2)[:, None]
             weights = weight * area * jnp.abs(wi @ normal) / distance2
-            return jnp.sum(_times(weights, _arriving(brdf, radiance, frame, wo, wi @ frame.T), 1), axis=0)
+            return jnp.sum(_times(weights, _integrand(brdf, radiance, frame, wo, wi @ frame.T), 1), axis=0)
 
         total = jnp.sum(jax.lax.map(triangle, (outline, jnp.roll(outline, -1, axis=0))), axis=0)
         return jnp.where(lit, total, jnp.zeros_like(total))

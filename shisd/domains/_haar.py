@@ -15,10 +15,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import dot
 from shisd._typing import Array, Float
 from shisd.domains._moments import Loop
-from shisd.domains._polygon import SphericalPolygon, clip, loop_solid_angle
+from shisd.domains._polygon import SphericalPolygon, clip, loop_solid_angle, on_sphere
 
 
 class HaarBasis(eqx.Module):
@@ -116,8 +116,7 @@ def clip_to_cells(v: Loop, levels: int) -> Float[Array, "3 t q"]:
     v = jnp.broadcast_to(v[..., None], (*v.shape, count)).reshape(*v.shape[:2], -1)
     for n in np.moveaxis(normals, (1, 2), (0, 1)):
         side = jnp.asarray(np.tile(n, v.shape[2] // count), v.dtype)[:, None]
-        v = clip(v, jnp.einsum("isp,isp->sp", v, jnp.broadcast_to(side, v.shape)))
-        v = jnp.moveaxis(normalize(jnp.moveaxis(v, 0, -1)), -1, 0)
+        v = on_sphere(clip(v, dot(v, side)))
     return v
 
 

@@ -4,7 +4,7 @@ An expansion is integrated through zonal functions about shared axes, which are 
 axes z_k that resolve each band, I_l(z_k) = 4 pi/(2l+1) sum_m y_l^m(z_k) c_l^m determines the integrals c_l^m of the
 basis. The other route, without axes, writes the gradient of r^l y_l^m as harmonics of degree l-1 and integrates those
 along the edges by quadrature (`line_coefficients` in tests/bench). It is smooth to every order and more accurate for
-large polygons, but takes two to five times as long, and small polygons lose digits in it.
+large polygons, but takes longer, and small polygons lose digits in it.
 """
 
 import functools

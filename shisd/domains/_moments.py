@@ -325,15 +325,12 @@ def _arcs(v: Loop) -> _Arcs:
     kappa = jnp.where(near, tau2 / (1 + jnp.sqrt(jnp.where(near, 1 - tau2, 1))), 1 - cosine)
     end, tau_next, kappa_next = jnp.roll(v, -1, 1), jnp.roll(tau, -1, 1), jnp.roll(kappa, -1, 0)
     d_tau, d_kappa = tau_next - tau, kappa_next - kappa
-    chord, middle = d_tau - d_kappa[None] * c, v + end
-    t2 = dot(chord, chord) / dot(middle, middle)
-    none, t, tail = _none(t2), safe_sqrt(t2), _arctan_tail(t2)
-    ratio, ratio_1 = (1 + t2) * (1 + tail), t2 + tail * (1 + t2)  # theta / sin(theta)
-    short = (t2 < 1)[None]
-    normal = ratio[None] * cross(v, jnp.where(short, chord, middle))
+    chord = d_tau - d_kappa[None] * c
+    t2, tail, ratio, normal = _turns(v, end, chord)
+    none, t, ratio_1 = _none(t2), safe_sqrt(t2), t2 + tail * (1 + t2)
     around = cross(jnp.broadcast_to(c, v.shape), chord)  # these add up to 0
     parts = ratio_1[None] * around + ratio[None] * cross(tau - kappa[None] * c, chord)
-    parts = jnp.where(short, parts, normal - around)  # the same, where the chord is not small
+    parts = jnp.where((t2 < 1)[None], parts, normal - around)  # the same, where the chord is not small
     edges = _Edges(
         tau, tau_next, d_tau, normal, kappa, kappa_next, d_kappa,
         over_angle=_over(2 * t * (1 + tail), none), over_sine=_over(2 * t / (1 + t2), none),
@@ -346,16 +343,22 @@ def _arcs(v: Loop) -> _Arcs:
 def _spans(v: Loop) -> Float[Array, "rows e p"]:
     end = jnp.roll(v, -1, 1)
     chord, middle = end - v, v + end
-    chord2, middle2 = dot(chord, chord), dot(middle, middle)
-    t2 = chord2 / middle2
-    none, tail = _none(t2), _arctan_tail(t2)
-    angle, half_sine = 2 * safe_sqrt(t2) * (1 + tail), 0.5 * safe_sqrt(chord2)
-    normal = ((1 + t2) * (1 + tail))[None] * cross(v, jnp.where((t2 < 1)[None], chord, middle))
-    over_half_cosine = 2 / jnp.sqrt(middle2)
+    t2, tail, _, normal = _turns(v, end, chord)
+    none, angle, half_sine = _none(t2), 2 * safe_sqrt(t2) * (1 + tail), 0.5 * safe_sqrt(dot(chord, chord))
+    over_half_cosine = 2 / jnp.sqrt(dot(middle, middle))
     spans = _Spans(
         v, end, chord, normal, angle, _over(angle, none), half_sine, _over(half_sine, none), over_half_cosine
     )
     return _pack(spans)
+
+
+def _turns(start: Array, end: Array, chord: Array) -> tuple[Array, Array, Array, Array]:
+    """Of edges: t^2, arctan(t)/t - 1, theta / sin(theta), and theta n."""
+    middle = start + end
+    t2 = dot(chord, chord) / dot(middle, middle)
+    tail = _arctan_tail(t2)
+    ratio = (1 + t2) * (1 + tail)
+    return t2, tail, ratio, ratio[None] * cross(start, jnp.where((t2 < 1)[None], chord, middle))
 
 
 def _none(t2: Array) -> Array:

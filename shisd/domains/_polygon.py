@@ -143,11 +143,16 @@ def _far_from_opposites(v: Loop) -> Float[Array, "3 p"]:
     return candidates[jnp.argmax(nearest, axis=0)].T
 
 
+def on_sphere(points: Loop) -> Loop:
+    """Loops of points of any length as unit vertices."""
+    return jnp.moveaxis(normalize(jnp.moveaxis(points, 0, -1)), -1, 0)
+
+
 def clip(points: Loop, height: Float[Array, "s p"]) -> Float[Array, "3 t p"]:
     """Loops cut off where `height`, linear along their edges, is negative: t = s + s // 2 slots.
 
     Sutherland and Hodgman 1974, without branches; of flat polygons and of spherical ones, whose arcs are projected
-    chords. Lengths are not kept.
+    chords. Lengths are not kept: see `on_sphere`.
     """
     slots = points.shape[1]
     inside = height > 0

@@ -34,7 +34,7 @@ class PolygonLight(eqx.Module):
         profile: ArrayLike | None = None,
         two_sided: bool = False,
     ):
-        p, e = _points(points), _checks.real_array("emission", emission)
+        p, e = _checks.outline("points", points), _checks.real_array("emission", emission)
         if e.ndim > 1:
             raise ValueError(f"`emission` must be a scalar or [colour]; got shape {list(e.shape)}.")
         f = None if profile is None else _expansion("profile", profile)
@@ -66,7 +66,7 @@ class PortalLight(eqx.Module):
     two_sided: ClassVar[bool] = False
 
     def __init__(self, points: ArrayLike, coefficients: ArrayLike, degree: int):
-        p, c = _points(points), _expansion("coefficients", coefficients)
+        p, c = _checks.outline("points", points), _expansion("coefficients", coefficients)
         self.degree = _checks.degree(degree)
         dtype = jnp.promote_types(p.dtype, c.dtype)
         self.points, self.coefficients = p.astype(dtype), c.astype(dtype)
@@ -79,16 +79,9 @@ class PortalLight(eqx.Module):
 
 def lobe_product(light: Float[Array, "*colour_n"], degree: int) -> Float[Array, "*colour_n_m"]:
     """From coefficients of a lobe of this degree to those of its product with a light, all of them."""
-    light_degree = int(light.shape[-1] ** 0.5) - 1
+    light_degree = _checks.degree_of(light.shape[-1])
     rows = [product_matrix(c, light_degree + degree, input_degree=degree) for c in light.reshape(-1, light.shape[-1])]
     return jnp.stack(rows).reshape(*light.shape[:-1], *rows[0].shape)
-
-
-def _points(points: ArrayLike) -> Float[Array, "s 3"]:
-    p = _checks.vectors("points", points)
-    if p.ndim != 2 or p.shape[0] < 3:
-        raise ValueError(f"`points` must have shape [S, 3] with at least 3 points; got {list(p.shape)}.")
-    return p
 
 
 def _expansion(name: str, value: ArrayLike) -> Float[Array, "*colour_n"]:

@@ -11,10 +11,10 @@ notation: R = (t, b, n) local to world; e = light coefficients; R^T e = light in
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._numerics import times
 from shisd._typing import Array, Float
 from shisd.harmonics._rotation import rotate_many
 from shisd.shading._lobes import Lobes, lookup_table
@@ -63,13 +63,12 @@ def shade_environment(
 def _shade(
     lobes: Lobes, e: Float[Array, "*c n"], points: dict[str, Float[Array, "p 3"]], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    degree = int(np.sqrt(e.shape[-1])) - 1
+    degree = _checks.degree_of(e.shape[-1])
 
     def radiance(frame: Float[Array, "p 3 3"], slices: Float[Array, "*s n p"]) -> Float[Array, "*colour p"]:
         light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(frame, 1, 2), degree, lobes.isotropic)
         light = jnp.moveaxis(light.reshape(light.shape[0], *e.shape[:-1], -1), 0, -2)
-        shape = (*colour, *light.shape[-2:])
-        return jnp.sum(jnp.broadcast_to(slices, shape) * jnp.broadcast_to(light, shape), axis=-2)
+        return jnp.sum(times(slices, light), axis=-2)
 
     size = min(2048, 1 << max(1, _NUMBERS_AT_ONCE // e.size).bit_length() - 1)
     return shade_tiles(lobes, lookup_table(lobes, degree), points, colour, size, radiance)

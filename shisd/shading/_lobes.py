@@ -89,7 +89,7 @@ def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p
     """Interpolated SH coefficients of the slices, in the local frame: [*colour, n, p]."""
     if lobes.isotropic:
         # the table holds the slice of azimuth 0; turned by phi, m mixes with -m
-        degree = int(np.sqrt(table.shape[-2])) - 1
+        degree = _checks.degree_of(table.shape[-2])
         m, l = _tables.orders(degree), _tables.bands(degree)
         c = table @ _views.spline_weights(view, table.shape[-1] - 4)
         cos, sin = _views.azimuth_factors(view, degree + 1)

@@ -10,7 +10,6 @@ b . M c, and M^T b are the coefficients of the light that comes through the outl
 only they are turned to the local frame.
 """
 
-import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -20,13 +19,13 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import times
 from shisd._typing import Array, Float
 from shisd.domains import HaarBasis, _moments
 from shisd.domains._haar import clip_to_cells
 from shisd.domains._integrate import loop_coefficients, zonal_inverse
 from shisd.domains._moments import Loop
-from shisd.domains._polygon import clip, loop_solid_angle
+from shisd.domains._polygon import clip, loop_solid_angle, on_sphere
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
 from shisd.models import PolygonLight, PortalLight
@@ -153,14 +152,14 @@ def _shade(
             angle = loop_solid_angle(v, 2 * np.pi, _up(v))
             if product is None:
                 lit = jnp.stack([_constant(s, v, angle, axes, degree) for s in slices.reshape(-1, *slices.shape[-2:])])
-                lit = _times(lit.reshape(*lobes.colour, -1), _constant_radiance(light))
+                lit = times(lit.reshape(*lobes.colour, -1), _constant_radiance(light))
             else:
                 world = jnp.einsum("pij,jsp->isp", frame, v)
                 seen = _through(product, world, angle).reshape(-1, slices.shape[-2], v.shape[2])
                 seen = rotate_many(jnp.moveaxis(seen, 0, 1), jnp.swapaxes(frame, 1, 2), degree, lobes.isotropic)
                 seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *slices.shape[-2:])
-                lit = jnp.sum(_times(slices, seen), axis=-2)
-            total += jnp.broadcast_to(_times(lit, sign), total.shape)
+                lit = jnp.sum(times(slices, seen), axis=-2)
+            total += jnp.broadcast_to(times(lit, sign), total.shape)
         return total
 
     size = _TILE if all(product is None for product in products) else _SMALL_TILE
@@ -174,20 +173,19 @@ def _project(light: Light, positions: Float[Array, "p 3"], basis: int | HaarBasi
 
     def project(tile: dict[str, Array]) -> Float[Array, " p *colour_n"]:
         relative = light.points.T[:, :, None] - tile["positions"].T[:, None]
-        sign, v = _facing(light, relative), _on_sphere(relative)
+        sign, v = _facing(light, relative), on_sphere(relative)
         if isinstance(basis, HaarBasis):
             v = clip_to_cells(v, basis.levels)
-            angle = loop_solid_angle(v, 2 * np.pi)
-            integrals = incident @ loop_coefficients(v, angle, _degree(incident.shape[-1]))
+        angle = loop_solid_angle(v, 2 * np.pi)
+        if isinstance(basis, HaarBasis):
+            integrals = incident @ loop_coefficients(v, angle, _checks.degree_of(incident.shape[-1]))
             c = basis.coefficients(integrals.reshape(*integrals.shape[:-1], -1, basis.size))
             c = jnp.swapaxes(c, -1, -2)  # [*colour, n, p], as below
+        elif product is None:
+            c = times(loop_coefficients(v, angle, basis), _constant_radiance(light)[..., None])
         else:
-            angle = loop_solid_angle(v, 2 * np.pi)
-            if product is None:
-                c = _times(loop_coefficients(v, angle, basis), _constant_radiance(light)[..., None])
-            else:
-                c = _through(product, v, angle)
-        return jnp.moveaxis(_times(c, sign), -1, 0)
+            c = _through(product, v, angle)
+        return jnp.moveaxis(times(c, sign), -1, 0)
 
     size = 1 + 2048 // basis.size if isinstance(basis, HaarBasis) else _SMALL_TILE
     return in_tiles(project, {"positions": positions}, size)
@@ -198,7 +196,7 @@ def _outline(light: Light, position: Float[Array, "p 3"], frame: Float[Array, "p
     relative = light.points.T[:, :, None] - position.T[:, None]
     local = jnp.einsum("pij,isp->jsp", frame, relative)
     sign = jnp.where(jnp.max(local[2], axis=0) > 0, _facing(light, relative), 0)
-    return _on_sphere(clip(local, local[2])), sign
+    return on_sphere(clip(local, local[2])), sign
 
 
 def _facing(light: Light, relative: Loop) -> Float[Array, " p"]:
@@ -206,10 +204,6 @@ def _facing(light: Light, relative: Loop) -> Float[Array, " p"]:
     outwards = jnp.cross(light.points, jnp.roll(light.points, -1, 0)).sum(axis=0)
     side = jnp.sign(outwards @ relative[:, 0])
     return side if light.two_sided else jnp.minimum(side, 0)
-
-
-def _on_sphere(points: Loop) -> Loop:
-    return jnp.moveaxis(normalize(jnp.moveaxis(points, 0, -1)), -1, 0)
 
 
 def _up(v: Loop) -> Float[Array, "3 p"]:
@@ -231,8 +225,8 @@ def _incident(light: Light) -> Float[Array, "*colour_n"]:
         return light.coefficients
     if light.profile is None:
         return light.emission[..., None] * np.sqrt(4 * np.pi)
-    parity = (-1.0) ** _tables.bands(_degree(light.profile.shape[-1]))
-    return _times(_times(light.profile, jnp.asarray(parity, light.profile.dtype)), light.emission[..., None])
+    parity = (-1.0) ** _tables.bands(_checks.degree_of(light.profile.shape[-1]))
+    return times(times(light.profile, jnp.asarray(parity, light.profile.dtype)), light.emission[..., None])
 
 
 def _constant_radiance(light: Light) -> Float[Array, "*colour 1"]:
@@ -242,7 +236,7 @@ def _constant_radiance(light: Light) -> Float[Array, "*colour 1"]:
 def _product(light: Light, degree: int) -> Float[Array, "*colour_n_m"] | None:
     """From coefficients of a slice to those of slice times light; None where light is constant."""
     incident = _incident(light)
-    light_degree = _degree(incident.shape[-1])
+    light_degree = _checks.degree_of(incident.shape[-1])
     if light_degree == 0:
         return None
     if isinstance(light, PortalLight):
@@ -252,14 +246,5 @@ def _product(light: Light, degree: int) -> Float[Array, "*colour_n_m"] | None:
 
 def _through(product: Float[Array, "*colour_n_m"], v: Loop, solid_angle: Array) -> Float[Array, "*c n p"]:
     """Coefficients of a light cut off outside loops."""
-    b = loop_coefficients(v, solid_angle, _degree(product.shape[-2]))
+    b = loop_coefficients(v, solid_angle, _checks.degree_of(product.shape[-2]))
     return jnp.einsum("...tn,tp->...np", product, b)
-
-
-def _degree(coefficients: int) -> int:
-    return math.isqrt(coefficients) - 1
-
-
-def _times(a: Array, b: Array) -> Array:
-    shape = np.broadcast_shapes(a.shape, b.shape)
-    return jnp.broadcast_to(a, shape) * jnp.broadcast_to(b, shape)
