@@ -378,11 +378,11 @@ def bench_ridge(ridges=(1e-2, 1e-4, 1e-6, 1e-8, 1e-10), degree=8, count=64):
     quad = POLYGON_LIGHT.astype(float)
     rows = [{"ridge": ridge} for ridge in ridges]
     for name, make in {"Lambertian": lambda: models.Lambertian(0.8), "GGX 0.5": lambda: models.Ggx(0.5, 0.04)}.items():
+        with jax.enable_x64(True):
+            exact = [x.astype(float) for x in (position, normal, view)]
+            truth = np.asarray(reference.shade_polygon_quadrature(make(), quad, 1.0, *exact, nodes=48))
         for dtype in (np.float32, np.float64):
             points = [x.astype(dtype) for x in (position, normal, view)]
-            with jax.enable_x64(True):
-                exact = [x.astype(float) for x in points]
-                truth = np.asarray(reference.shade_polygon_quadrature(make(), quad, 1.0, *exact, nodes=48))
             with jax.enable_x64(dtype == np.float64):
                 axes = decomposition.optimized_directions(degree, dtype=dtype)
                 basis = decomposition.RotatedZonalBasis(axes, degree)
@@ -450,15 +450,25 @@ def table(rows):
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def paste(name, text):
+    """Put a text between the README's markers of a name."""
+    readme, start = Path("README.md"), f"<!-- table:{name} -->"
+    before, rest = readme.read_text().split(start)
+    readme.write_text(f"{before}{start}\n{text}\n<!-- /table -->{rest.split('<!-- /table -->', 1)[1]}")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, default=Path("output/bench"))
     parser.add_argument("--only", choices=BENCHES, action="append")
     parser.add_argument("--readme", action="store_true", help="put the tables into README.md")
+    parser.add_argument("--paste", nargs=2, metavar=("NAME", "FILE"), help="put an example's table into README.md")
     parser.add_argument("--memory-child", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.memory_child is not None:
         return memory_child(arguments.memory_child)
+    if arguments.paste:
+        return paste(arguments.paste[0], Path(arguments.paste[1]).read_text().rstrip())
     arguments.output.mkdir(parents=True, exist_ok=True)
     results, sections = {}, []
     for name in arguments.only or BENCHES:
@@ -476,9 +486,7 @@ def main():
     (arguments.output / "bench.json").write_text(json.dumps(results, indent=1))
     (arguments.output / "bench.md").write_text(text + "\n")
     if arguments.readme:
-        readme = Path("README.md")
-        before, rest = readme.read_text().split("<!-- table:bench -->")
-        readme.write_text(f"{before}<!-- table:bench -->\n{text}\n<!-- /table -->{rest.split('<!-- /table -->', 1)[1]}")
+        paste("bench", text)
 
 
 if __name__ == "__main__":
