@@ -25,10 +25,18 @@ def legendre(x: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
     Source: DLMF 14.10.3, differences in 1 - |x|.
     """
     x, degree = _checks.real_array("x", x), _checks.degree(degree)
-    # P_l(-x) = (-1)^l P_l(x). A selection, not abs and sign, so that the derivative at x = 0 is the right one.
-    sign = jnp.where(x < 0, -1, 1).astype(x.dtype)
-    t = 1 - sign * x
-    one = jnp.ones_like(x)
+    # A selection, not abs and sign, so that the derivative at x = 0 is the right one.
+    return _series(1 - jnp.where(x < 0, -1, 1).astype(x.dtype) * x, x < 0, degree)
+
+
+def legendre_of_versine(t: Float[Array, "*batch"], degree: int) -> Float[Array, "*batch n"]:
+    """P_0 ... P_L at the cosines 1 - t, t in [0, 2]: exact digits next to the pole, where 1 - t has lost those of t."""
+    return _series(jnp.where(t > 1, 2 - t, t), t > 1, degree)
+
+
+def _series(t: Float[Array, "*batch"], mirrored: Array, degree: int) -> Float[Array, "*batch n"]:
+    """P_l(1 - t), or P_l(t - 1) = (-1)^l P_l(1 - t) where `mirrored`."""
+    one = jnp.ones_like(t)
 
     def step(carry, l):
         p, difference = carry  # P_(l-1) and P_l - P_(l-1)
@@ -36,11 +44,11 @@ def legendre(x: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
         return (p, (l * difference - (2 * l + 1) * t * p) / (l + 1)), p
 
     # Short series are unrolled: faster. Long ones are not: unrolled, degree 100 takes 8 s to compile.
-    degrees = jnp.arange(1, degree + 1).astype(x.dtype)
+    degrees = jnp.arange(1, degree + 1).astype(t.dtype)
     _, series = jax.lax.scan(step, (one, -t), degrees, unroll=4 if degree > 16 else max(degree, 1))
     series = jnp.concatenate([one[None], series])
-    odd = np.arange(degree + 1).reshape(-1, *[1] * x.ndim) % 2 == 1
-    return jnp.moveaxis(jnp.where(odd & (x < 0)[None], -series, series), 0, -1)
+    odd = np.arange(degree + 1).reshape(-1, *[1] * t.ndim) % 2 == 1
+    return jnp.moveaxis(jnp.where(odd & mirrored[None], -series, series), 0, -1)
 
 
 def zonal_basis(x: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
