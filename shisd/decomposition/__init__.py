@@ -10,3 +10,10 @@ from shisd.decomposition._directions import low_discrepancy_directions as low_di
 from shisd.decomposition._directions import optimize_directions as optimize_directions
 from shisd.decomposition._directions import optimized_directions as optimized_directions
 from shisd.decomposition._directions import random_directions as random_directions
+from shisd.decomposition._fit import FitStatus as FitStatus
+from shisd.decomposition._fit import LobeFit as LobeFit
+from shisd.decomposition._fit import fit_lobes as fit_lobes
+from shisd.decomposition._fit import lobe_starts as lobe_starts
+from shisd.decomposition._mixtures import GaussianLobes as GaussianLobes
+from shisd.decomposition._mixtures import ZonalLobes as ZonalLobes
+from shisd.decomposition._sparse import sparse_weights as sparse_weights

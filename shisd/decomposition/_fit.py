@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.scipy.linalg import solve_triangular
+from jax.scipy.linalg import cho_factor, cho_solve
 from jax.typing import ArrayLike
 
 from shisd import _checks
@@ -53,6 +53,7 @@ def fit_lobes(
     *,
     max_steps: int = 256,
     tolerance: float | None = None,
+    ridge: float = 0.0,
 ) -> LobeFit:
     """The lobes nearest to samples of a function on the sphere, in least squares weighed by solid angle.
 
@@ -61,7 +62,9 @@ def fit_lobes(
     Arguments: `start`, GaussianLobes or ZonalLobes, or several of one kind and size (`lobe_starts`): their weights are
     not used, except for the degree of ZonalLobes. `directions` [N, 3]; `values` [*colour, N]; `solid_angles` [N] >= 0
     in sr, the weights of the samples. Colours share axes and widths. Samples should cover the whole sphere, for nothing
-    holds lobes down where there are none. Static `max_steps` for each start; `tolerance` of the parameters and of the
+    holds lobes down where there are none. `ridge` >= 0 adds the squared norms of the lobes, so many times, to the
+    squared error: large lobes that cancel are then avoided, and neighbouring fits can be interpolated (1e-2 is enough);
+    it is at least what rounding needs. Static `max_steps` for each start; `tolerance` of the parameters and of the
     squared error over that of the samples, by default eps^(1/2).
     Returns a `LobeFit`; a fit that does not converge keeps its best lobes, and the status says what to try.
     Derivatives: none; differentiate `evaluate` or `coefficients` of the result.
@@ -76,12 +79,19 @@ def fit_lobes(
         raise ValueError(f"`values` has {y.size} samples for {unknowns} unknowns. Add samples or use fewer lobes.")
     stacked = jax.tree.map(lambda *x: jnp.stack(x).astype(w.dtype), *starts)
     tolerance = float(jnp.finfo(w.dtype).eps) ** 0.5 if tolerance is None else float(tolerance)
-    return _fit(stacked, w, y, areas, _checks.integer("max_steps", max_steps, 1), tolerance)
+    least = 8 * starts[0].linear.shape[-1] * float(jnp.finfo(w.dtype).eps)
+    return _fit(stacked, w, y, areas, _checks.integer("max_steps", max_steps, 1), tolerance, max(float(ridge), least))
 
 
 @eqx.filter_jit
 def _fit(
-    starts: AbstractLobes, w: Array, y: Float[Array, "*colour N"], areas: Array, max_steps: int, tolerance: float
+    starts: AbstractLobes,
+    w: Array,
+    y: Float[Array, "*colour N"],
+    areas: Array,
+    max_steps: int,
+    tolerance: float,
+    ridge: float,
 ) -> LobeFit:
     root = jnp.sqrt(areas)[:, None]
     target = y.reshape(-1, w.shape[0]).T * root  # [N, C]
@@ -89,33 +99,37 @@ def _fit(
     scale = eqx.error_if(scale, ~(scale > 0), "`values` are zero wherever they count: there is nothing to fit.")
     target = target / scale
 
+    def error2(columns, weights):
+        rest = columns @ weights - target
+        return jnp.sum(rest * rest)
+
     def loss(parameters, template):
         columns = _place(template, parameters).columns(w) * root
         # at the best weights the loss is flat in them, so its gradient need not follow them
-        rest = columns @ _best_weights(jax.lax.stop_gradient(columns), target) - target
-        return jnp.sum(rest * rest)
+        a = _best_weights(jax.lax.stop_gradient(columns), target, ridge)
+        return error2(columns, a) + ridge * jnp.sum((_lengths(columns)[:, None] * a) ** 2)
 
     def run(template):
         template = _checked_start(template)
         first = _parameters(template)
-        found = optx.minimise(
-            loss, optx.BFGS(tolerance, tolerance), first, template, max_steps=max_steps, throw=False
-        )
+        found = optx.minimise(loss, optx.BFGS(tolerance, tolerance), first, template, max_steps=max_steps, throw=False)
         before, after = loss(first, template), loss(found.value, template)
         better = after <= before  # False for NaN
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), found.value, first)
         limit = found.result == optx.RESULTS.nonlinear_max_steps_reached
         status = FitStatus.where(limit, FitStatus.step_limit, FitStatus.diverged)
         status = FitStatus.where(better & (found.result == optx.RESULTS.successful), FitStatus.ok, status)
-        return best, jnp.sqrt(jnp.where(better, after, before)), found.stats["num_steps"], status
+        return best, jnp.where(better, after, before), found.stats["num_steps"], status
 
     # One start after another: batched factorisations may wait for each other for ever (see `_basis`).
-    parameters, errors, steps, status = jax.lax.map(run, starts)
-    best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))
+    parameters, losses, steps, status = jax.lax.map(run, starts)
+    best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
     parameters, template, status = jax.tree.map(lambda x: x[best], (parameters, starts, status))
     lobes = _place(template, parameters)
-    weights = _best_weights(lobes.columns(w) * root, target).T * scale
-    return LobeFit(lobes.with_linear(weights.reshape(*y.shape[:-1], -1)), errors[best], jnp.sum(steps), status)
+    columns = lobes.columns(w) * root
+    weights = _best_weights(columns, target, ridge)
+    lobes = lobes.with_linear((scale * weights.T).reshape(*y.shape[:-1], -1))
+    return LobeFit(lobes, jnp.sqrt(error2(columns, weights)), jnp.sum(steps), status)
 
 
 def lobe_starts(
@@ -155,9 +169,10 @@ def _peel(w: Float[Array, "N 3"], y: Float[Array, "C N"], areas: Float[Array, " 
     rungs = jnp.asarray(np.arange(16) / 15, w.dtype)
     root = jnp.sqrt(areas)[:, None]
     target = y.T * root
+    ridge = 8 * count * float(jnp.finfo(w.dtype).eps)
 
     def peel(columns, j):
-        rest = target - columns @ _best_weights(columns, target)
+        rest = target - columns @ _best_weights(columns, target, ridge)
         top = jnp.argmax(jnp.sum(rest * rest, axis=1) / jnp.maximum(areas, jnp.finfo(w.dtype).tiny))
         narrowest = jnp.maximum(2 * np.pi / areas[top], 1.0)
         # a hair wider each time, so that no two lobes are one
@@ -169,16 +184,26 @@ def _peel(w: Float[Array, "N 3"], y: Float[Array, "C N"], areas: Float[Array, " 
 
     empty = jnp.zeros((w.shape[0], count), w.dtype)
     columns, (z, sharpness) = jax.lax.scan(peel, empty, jnp.arange(count))
-    return GaussianLobes(z, sharpness, _best_weights(columns, target).T)
+    return GaussianLobes(z, sharpness, _best_weights(columns, target, ridge).T)
 
 
-def _best_weights(columns: Float[Array, "N m"], target: Float[Array, "N c"]) -> Float[Array, "m c"]:
-    """Weights of least squares by QR, with a ridge of the size of the rounding: columns may be alike, or zero."""
-    norm = jnp.sqrt(jnp.sum(columns * columns, axis=0))
-    norm = jnp.where(norm > 0, norm, 1)
-    ridge = float(jnp.finfo(columns.dtype).eps) ** 0.5 * jnp.eye(columns.shape[1], dtype=columns.dtype)
-    q, r = jnp.linalg.qr(jnp.concatenate([columns / norm[None], ridge]))
-    return solve_triangular(r, q[: columns.shape[0]].T @ target) / norm[:, None]
+def _best_weights(columns: Float[Array, "N m"], target: Float[Array, "N c"], ridge: float) -> Float[Array, "m c"]:
+    """Weights of least squares, of columns scaled to unit length plus `ridge`: they may be alike, or zero.
+
+    Normal equations, three times faster than QR here, and one step of refinement for the digits they lose.
+    """
+    norm = _lengths(columns)
+    scaled = columns / norm[None]
+    gram = scaled.T @ scaled + ridge * jnp.eye(norm.size, dtype=norm.dtype)
+    factor = cho_factor(gram)
+    a = cho_solve(factor, scaled.T @ target)
+    a = a + cho_solve(factor, scaled.T @ (target - scaled @ a) - ridge * a)
+    return a / norm[:, None]
+
+
+def _lengths(columns: Float[Array, "N m"]) -> Float[Array, " m"]:
+    square = jnp.sum(columns * columns, axis=0)
+    return jnp.sqrt(jnp.where(square > 0, square, 1))
 
 
 def _parameters(lobes: AbstractLobes) -> tuple[Array, ...]:
