@@ -30,9 +30,9 @@ class FitStatus(eqx.Enumeration):
     step_limit = (
         "The fit used up its steps; its best lobes are kept. Raise `max_steps` or `tolerance`, or give other starts."
     )
-    diverged = (
-        "The fit broke down and its start is kept. Give other starts (decomposition.lobe_starts), fewer lobes, or work "
-        "in float64."
+    degenerate = (
+        "A lobe has become narrower than the samples are apart, or has no value at them, and means nothing. Use fewer "
+        "lobes, more samples, a `ridge`, or other starts (decomposition.lobe_starts)."
     )
 
 
@@ -70,6 +70,8 @@ def fit_lobes(
     Derivatives: none; differentiate `evaluate` or `coefficients` of the result.
     Cost: steps x N x (columns)^2.
     """
+    if not ridge >= 0:
+        raise ValueError(f"`ridge` must be >= 0; got {ridge}.")
     starts = [start] if isinstance(start, AbstractLobes) else list(start)
     _check_starts(starts)
     w, y, areas = _samples(directions, values, solid_angles)
@@ -116,9 +118,7 @@ def _fit(
         before, after = loss(first, template), loss(found.value, template)
         better = after <= before  # False for NaN
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), found.value, first)
-        limit = found.result == optx.RESULTS.nonlinear_max_steps_reached
-        status = FitStatus.where(limit, FitStatus.step_limit, FitStatus.diverged)
-        status = FitStatus.where(better & (found.result == optx.RESULTS.successful), FitStatus.ok, status)
+        status = FitStatus.where(found.result == optx.RESULTS.successful, FitStatus.ok, FitStatus.step_limit)
         return best, jnp.where(better, after, before), found.stats["num_steps"], status
 
     # One start after another: batched factorisations may wait for each other for ever (see `_basis`).
@@ -128,6 +128,8 @@ def _fit(
     lobes = _place(template, parameters)
     columns = lobes.columns(w) * root
     weights = _best_weights(columns, target, ridge)
+    seen_by = jnp.sum(columns**2, axis=0) ** 2 / jnp.sum(columns**4, axis=0)  # samples, or NaN
+    status = FitStatus.where(jnp.all(seen_by > 1.5), status, FitStatus.degenerate)
     lobes = lobes.with_linear((scale * weights.T).reshape(*y.shape[:-1], -1))
     return LobeFit(lobes, jnp.sqrt(error2(columns, weights)), jnp.sum(steps), status)
 
@@ -253,7 +255,7 @@ def _checked_start(lobes: AbstractLobes) -> AbstractLobes:
     if isinstance(lobes, GaussianLobes):
         same_width = jnp.abs(lobes.sharpness[:, None] / lobes.sharpness[None] - 1) < 1e-3
         twins, what = (cosine > 1 - 1e-6) & same_width, "two lobes of equal axis and sharpness"
-        wrong = ~jnp.all(lobes.sharpness > 0)
+        wrong = ~jnp.all((lobes.sharpness > 0) & jnp.isfinite(lobes.sharpness))
     else:
         twins, what = jnp.abs(cosine) > 1 - 1e-6, "two axes that are equal or opposite, which is the same"
         wrong = jnp.zeros((), bool)
