@@ -261,9 +261,9 @@ def _near_axis(h: Float[Array, " k"], degree: int, nodes: int) -> tuple[Array, A
     The factors sqrt((2n+1) / 4 pi) of y_n^0 are in the second.
     """
     theta, gauss = _quadrature.gauss_rows(nodes)
-    t = h[:, None] * jnp.asarray(np.sin(theta / 2) ** 2, h.dtype)
-    p = legendre_of_versine(t, degree) * jnp.asarray(_tables.zonal_norms(degree), h.dtype)
-    return t, p, h[:, None] * jnp.asarray(np.pi * gauss, h.dtype)
+    t = h[:, None] * jnp.asarray(np.sin(theta / 2) ** 2, h.dtype)[None]
+    p = legendre_of_versine(t, degree) * jnp.asarray(_tables.zonal_norms(degree), h.dtype)[None, None]
+    return t, p, h[:, None] * jnp.asarray(np.pi * gauss, h.dtype)[None]
 
 
 def _gaussian_integral(k: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

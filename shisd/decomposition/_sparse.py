@@ -17,7 +17,7 @@ from shisd.decomposition._basis import RotatedZonalBasis, _padding
 
 def sparse_weights(
     basis: RotatedZonalBasis, coefficients: ArrayLike, count: int
-) -> tuple[Float[Array, "*batch l K"], Float[Array, " {count}"]]:
+) -> tuple[Float[Array, "*batch l K"], Array]:
     """Weights on only `count` axes of a basis, and which: greedy, each axis with all of its bands.
 
     Every step takes the axis that lowers the squared error most, all weights being free (orthogonal least squares).

@@ -11,7 +11,6 @@ Tables of Gaussians and profiles are interpolated linearly in elevation: axes, l
 The reference is quadrature over every texel of the map (`shisd.reference`), the maps 256 x 512.
 """
 
-import functools
 import time
 import warnings
 from pathlib import Path
@@ -30,6 +29,7 @@ from tests.bench.timing import interleaved
 from tests.models.materials import GOLD_PAINT, NICKEL
 
 STEEPEST = np.radians(80)  # views of pictures and of slices that are judged
+DEGREES = (4, 8, 12, 16, 20, 30)
 PROFILE = 16  # degree of the profiles
 VIEWS = 32  # elevations of every table
 DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
@@ -51,7 +51,9 @@ GOLD = {
     "shift": [-0.284195, -0.277297, -0.245352],
 }
 ABC = {  # diffuse, a, b, c, ior
-    "color-changing-paint3": ([0.007087, 0.004775, 0.003475], [35.495728, 34.895355, 33.48082], 2193.942139, 1.442522, 1.918318),
+    "color-changing-paint3": (
+        [0.007087, 0.004775, 0.003475], [35.495728, 34.895355, 33.48082], 2193.942139, 1.442522, 1.918318
+    ),
     "red-plastic": ([0.268, 0.044432, 0.010675], [1.081538, 1.045352, 1.037089], 34.117554, 1.529797, 1.66645),
     "pvc": ([0.030285, 0.033992, 0.038152], [40.608692, 39.046635, 37.916531], 2901.928223, 1.203405, 1.407985),
 }  # fmt: skip
@@ -81,7 +83,7 @@ def load_map(name):
 
 
 def sphere_points(rows, columns):
-    """Normals and views [rows * columns, 3] of a sphere seen along a horizontal direction, equally spread in the picture."""
+    """Normals and views [rows * columns, 3] of a sphere seen from far away, equally spread in the picture."""
     i, j = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     radius, angle = np.sin(STEEPEST) * np.sqrt((i.ravel() + 0.5) / rows), 2 * np.pi * (j.ravel() + 0.5) / columns
     view = np.array([np.cos(5.0), np.sin(5.0), 0.0])
@@ -110,35 +112,31 @@ def elevations(count=VIEWS):
 
 
 @eqx.filter_jit
-def fit_table(brdf, start_of, ridge=0.0):
-    """The fits of all elevations, from the normal to the horizon: lobes with a leading axis, and their total steps.
+def fit_table(brdf, count, degree=None):
+    """Fits for all elevations, from the normal to the horizon, with a leading axis: Gaussians, or profiles of a degree.
 
-    Each starts from the last one, turned with the mirror direction.
+    Each starts from the last one, turned with the mirror direction. The ridges are the best of 0, 1e-4, 1e-3, 1e-2.
     """
     theta = jnp.asarray(elevations(), jnp.float32)
     step = np.pi / 2 / VIEWS
     turn = jnp.asarray([[np.cos(step), 0, -np.sin(step)], [0, 1, 0], [np.sin(step), 0, np.cos(step)]], jnp.float32)
     first = slice_samples(brdf, theta[0])
-    start = decomposition.fit_lobes(start_of(first), *first, ridge=ridge).lobes
+    ridge = 1e-2 if degree is None else 1e-3
+    starts = decomposition.lobe_starts(*first, count, starts=4)
+    if degree is not None:  # axes a little off the peaks, never twice one
+        z = normalize(starts[0].directions)
+        z = z + 0.05 * jnp.asarray(np.random.default_rng(0).normal(size=z.shape), z.dtype)
+        starts = decomposition.ZonalLobes(z, jnp.zeros((3, degree + 1, count), z.dtype))
+    start = decomposition.fit_lobes(starts, *first, ridge=ridge).lobes
 
     def fit(lobes, theta):
         lobes = eqx.tree_at(lambda x: x.directions, lobes, lobes.directions @ turn.T)
-        found = decomposition.fit_lobes(lobes, *slice_samples(brdf, theta), max_steps=128, tolerance=1e-4, ridge=ridge)
-        return found.lobes, (found.lobes, found.steps)
+        samples = slice_samples(brdf, theta)
+        lobes = decomposition.fit_lobes(lobes, *samples, max_steps=128, tolerance=1e-4, ridge=ridge).lobes
+        return lobes, lobes
 
-    _, (rest, steps) = jax.lax.scan(fit, start, theta[1:])
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, rest), jnp.sum(steps)
-
-
-def gaussian_start(count, samples):
-    return decomposition.lobe_starts(*samples, count, starts=4)
-
-
-def profile_start(count, degree, samples):
-    peaks = decomposition.lobe_starts(*samples, 2 * count)[0]
-    z = normalize(peaks.directions)[:count]
-    z = normalize(z + 0.05 * jnp.asarray(np.random.default_rng(0).normal(size=z.shape), z.dtype))  # never twice one
-    return decomposition.ZonalLobes(z, jnp.zeros((3, degree + 1, count), z.dtype))
+    _, rest = jax.lax.scan(fit, start, theta[1:])
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, rest)
 
 
 def interpolated(table, theta):
@@ -159,23 +157,32 @@ def blended(table, theta):
     position = jnp.clip(theta * (VIEWS / (np.pi / 2)) - 0.5, 0, VIEWS - 1)
     lower = jnp.clip(position.astype(int), 0, VIEWS - 2)
     t = position - lower.astype(theta.dtype)
-    if isinstance(table, decomposition.GaussianLobes):
-        both = lambda x, axis: jnp.concatenate([x[lower], x[lower + 1]], axis=axis)
-        weights = jnp.concatenate([(1 - t) * table.weights[lower], t * table.weights[lower + 1]], axis=-1)
-        return decomposition.GaussianLobes(both(table.directions, 0), both(table.sharpness, 0), weights)
-    both = lambda x, axis: jnp.concatenate([x[lower], x[lower + 1]], axis=axis)
+    directions = jnp.concatenate([table.directions[lower], table.directions[lower + 1]])
     weights = jnp.concatenate([(1 - t) * table.weights[lower], t * table.weights[lower + 1]], axis=-1)
-    return decomposition.ZonalLobes(both(table.directions, 0), weights)
+    return decomposition.ZonalLobes(directions, weights)
+
+
+def projected_values(lobes, theta, w):
+    c = lobes.slice_coefficients(jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)]))
+    return jnp.stack([harmonics.evaluate(colour, w) for colour in c])
+
+
+def interpolated_values(table, theta, w):
+    return interpolated(table, theta).evaluate(w)
+
+
+def blended_values(table, theta, w):
+    return blended(table, theta).evaluate(w)
 
 
 @eqx.filter_jit
-def slice_error(brdf, values_at):
-    """RMS over elevations of the relative L2 error of a slice, between the table's, weighed as on a sphere's picture."""
+def slice_error(brdf, values, table):
+    """RMS over elevations between the table's of a slice's relative L2 error, weighed as on a sphere's picture."""
     theta = jnp.asarray(np.arange(1, VIEWS) * (np.pi / 2 / VIEWS), jnp.float32)
 
     def one(theta):
         w, y, area = slice_samples(brdf, theta, 24)
-        return jnp.sum((values_at(theta, w) - y) ** 2 * area[None]) / jnp.sum(y * y * area[None])
+        return jnp.sum((values(table, theta, w) - y) ** 2 * area[None]) / jnp.sum(y * y * area[None])
 
     share = jnp.where(theta < STEEPEST, jnp.sin(2 * theta), 0)
     return jnp.sqrt(jnp.sum(jax.lax.map(one, theta) * share) / jnp.sum(share))
@@ -296,85 +303,74 @@ def sparse_table(brdf, degree, count):
     return jax.lax.map(choose, jnp.asarray(elevations(), jnp.float32))
 
 
-def timed(function, *arguments):
+def timed(function):
+    """A result, and the seconds of the second call."""
+    jax.block_until_ready(function())
     start = time.perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return result, time.perf_counter() - start
+    return jax.block_until_ready(function()), time.perf_counter() - start
 
 
-def methods(brdf, lights):
-    """name -> (seconds to fit, values of a slice, radiance of pixels by map)."""
+def methods(brdf, bases):
+    """name -> (table, seconds to make it, how to take its values, how to shade with it under a light)."""
     made = {}
-    for degree in (4, 8, 12, 16, 20, 30):
-        basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-        tabulate = lambda basis=basis: shading.tabulate_brdf(brdf, basis, views=VIEWS, quadrature=64, throw=False)
-        tabulate()
-        lobes, seconds = timed(tabulate)
-
-        def values(theta, w, lobes=lobes):
-            c = lobes.slice_coefficients(jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)]))
-            return jnp.stack([harmonics.evaluate(colour, w) for colour in c])
-
-        shade = {
-            name: functools.partial(shading.shade_environment, lobes, light["coefficients"][:, : (degree + 1) ** 2])
-            for name, light in lights.items()
-        }
-        made[f"projection, degree {degree}"] = seconds, values, shade
+    most = bases[DEGREES[-1]]
+    exact, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64, throw=False))
+    c = exact.coefficients()
+    shade = lambda lobes, light, n, v: shading.shade_environment(
+        lobes, light["coefficients"][:, : (lobes.degree + 1) ** 2], n, v
+    )
+    for degree, basis in bases.items():
+        weights = basis.weights(c[..., : (degree + 1) ** 2])
+        lobes = shading.Lobes(basis, weights, exact.quadrature_error, True)
+        made[f"projection, degree {degree}"] = lobes, seconds, projected_values, shade
+    shade = lambda table, light, n, v: shade_gaussians(table, light["pyramid"], n, v)
     for count in (1, 3, 7):
-        start = functools.partial(gaussian_start, count)
-        fit_table(brdf, start, 1e-2)
-        (table, _), seconds = timed(fit_table, brdf, start, 1e-2)
-        values = lambda theta, w, table=table: interpolated(table, theta).evaluate(w)
-        shade = {name: functools.partial(shade_gaussians, table, light["pyramid"]) for name, light in lights.items()}
-        made[f"{count} Gaussian{'s' if count > 1 else ''}"] = seconds, values, shade
+        table, seconds = timed(lambda count=count: fit_table(brdf, count))
+        made[f"{count} Gaussian{'s' * (count > 1)}"] = table, seconds, interpolated_values, shade
+    shade = lambda table, light, n, v: shade_profiles(table, light["bands"], n, v, interpolated)
     for count in (1, 3):
-        start = functools.partial(profile_start, count, PROFILE)
-        fit_table(brdf, start, 1e-3)
-        (table, _), seconds = timed(fit_table, brdf, start, 1e-3)
-        values = lambda theta, w, table=table: interpolated(table, theta).evaluate(w)
-        shade = {
-            name: (lambda n, v, t=table, x=light["bands"]: shade_profiles(t, x, n, v, interpolated))
-            for name, light in lights.items()
-        }
-        made[f"{count} profile{'s' if count > 1 else ''}, degree {PROFILE}"] = seconds, values, shade
-    sparse_table(brdf, PROFILE, 3)
-    table, seconds = timed(sparse_table, brdf, PROFILE, 3)
-    values = lambda theta, w, table=table: blended(table, theta).evaluate(w)
-    shade = {
-        name: (lambda n, v, t=table, x=light["bands"]: shade_profiles(t, x, n, v, blended))
-        for name, light in lights.items()
-    }
-    made[f"sparse: 3 axes, degree {PROFILE}"] = seconds, values, shade
+        table, seconds = timed(lambda count=count: fit_table(brdf, count, PROFILE))
+        name = "1 axis with a profile" if count == 1 else f"{count} axes with profiles"
+        made[name] = table, seconds, interpolated_values, shade
+    shade = lambda table, light, n, v: shade_profiles(table, light["bands"], n, v, blended)
+    table, seconds = timed(lambda: sparse_table(brdf, PROFILE, 3))
+    made["3 sparse axes"] = table, seconds, blended_values, shade
     return made
 
 
 def compare(names=None):
-    lights, truths = {}, {}
+    """Rows of every material and method."""
+    axes = {degree: decomposition.optimized_directions(degree) for degree in DEGREES}
+    bases = {degree: decomposition.RotatedZonalBasis(z, degree) for degree, z in axes.items()}
+    lights = {}
     for name in MAPS:
         environment = load_map(name)
         lights[name] = {
             "environment": environment,
-            "coefficients": environment.coefficients(30),
+            "coefficients": environment.coefficients(DEGREES[-1]),
             "pyramid": gaussian_pyramid(environment),
             "bands": band_table(environment, PROFILE),
         }
-    few, many = sphere_points(16, 24), sphere_points(128, 128)
+    few, many = sphere_points(16, 16), sphere_points(128, 128)
     rows = []
     for material, brdf in materials().items():
         if names and material not in names:
             continue
-        for name, light in lights.items():
-            truths[name] = np.asarray(
-                reference.shade_environment_quadrature(brdf, light["environment"], *few, supersampling=1)
-            )
-        made = methods(brdf, lights)
-        shade = {method: shades["interior"] for method, (_, _, shades) in made.items()}
-        times = interleaved(shade, *many, seconds=0.2)
-        for method, (seconds, values, shades) in made.items():
-            row = {"material": material, "method": method, "slice error": float(slice_error(brdf, values))}
-            for name, truth in truths.items():
-                difference = np.asarray(shades[name](*few)) - truth
-                row[f"{name}: error"] = float(np.sqrt(np.mean(difference**2) / np.mean(truth**2)))
+        truth = {
+            name: np.asarray(reference.shade_environment_quadrature(brdf, light["environment"], *few, supersampling=1))
+            for name, light in lights.items()
+        }
+        made = methods(brdf, bases)
+        shades = {
+            method: lambda n, v, table=table, shade=shade: shade(table, lights["interior"], n, v)
+            for method, (table, _, _, shade) in made.items()
+        }
+        times = interleaved(shades, *many, seconds=0.2)
+        for method, (table, seconds, values, shade) in made.items():
+            row = {"material": material, "method": method, "slice error": float(slice_error(brdf, values, table))}
+            for name, light in lights.items():
+                difference = np.asarray(shade(table, light, *few)) - truth[name]
+                row[f"{name}: error"] = float(np.sqrt(np.mean(difference**2) / np.mean(truth[name] ** 2)))
             row |= {
                 "fit s": seconds,
                 "us/pixel": times[method].median / len(many[0]) * 1e6,
@@ -396,7 +392,7 @@ def figure(rows, path):
         "RZH projection, degree 4 to 30": (lambda m: m.startswith("projection"), "o-", "C0"),
         "1, 3, 7 Gaussians": (lambda m: "Gaussian" in m, "s-", "C1"),
         f"1, 3 axes with profiles to degree {PROFILE}": (lambda m: "profile" in m, "^-", "C2"),
-        "3 sparse axes": (lambda m: m.startswith("sparse"), "D", "C3"),
+        "3 sparse axes": (lambda m: "sparse" in m, "D", "C3"),
     }
     figure, panels = pyplot.subplots(2, 4, figsize=(11, 5.6), sharex=True, sharey=True, constrained_layout=True)
     for name, axes in zip(names, panels.flat, strict=False):

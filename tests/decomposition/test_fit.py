@@ -85,8 +85,8 @@ def test_derivatives_of_values_and_coefficients(kind, x64, rng):
     lobes = mixture(np.float64)
     if kind == "zonal":
         lobes = decomposition.ZonalLobes(lobes.directions, jnp.asarray(rng.normal(size=(3, 3))))
-    value = jax.jit(lambda lobes, w: jnp.sum(lobes.evaluate(w) ** 2) + jnp.sum(lobes.coefficients(4) ** 2))
-    check_grads(value, (lobes, w), order=2, modes=["fwd", "rev"])
+    value = jax.jit(lambda lobes, w: jnp.sum(lobes.evaluate(w) ** 2) + jnp.sum(lobes.coefficients(3) ** 2))
+    check_grads(value, (lobes, w), order=1, modes=["fwd", "rev"])
 
 
 def test_wrong_lobes(as_user):
