@@ -82,7 +82,8 @@ def fit_lobes(
     stacked = jax.tree.map(lambda *x: jnp.stack(x).astype(w.dtype), *starts)
     tolerance = float(jnp.finfo(w.dtype).eps) ** 0.5 if tolerance is None else float(tolerance)
     least = 8 * starts[0].linear.shape[-1] * float(jnp.finfo(w.dtype).eps)
-    return _fit(stacked, w, y, areas, _checks.integer("max_steps", max_steps, 1), tolerance, max(float(ridge), least))
+    ridge = jnp.asarray(max(ridge, least), w.dtype)
+    return _fit(stacked, w, y, areas, ridge, _checks.integer("max_steps", max_steps, 1), tolerance)
 
 
 @eqx.filter_jit
@@ -91,9 +92,9 @@ def _fit(
     w: Array,
     y: Float[Array, "*colour N"],
     areas: Array,
+    ridge: Scalar,
     max_steps: int,
     tolerance: float,
-    ridge: float,
 ) -> LobeFit:
     root = jnp.sqrt(areas)[:, None]
     target = y.reshape(-1, w.shape[0]).T * root  # [N, C]
@@ -171,7 +172,7 @@ def _peel(w: Float[Array, "N 3"], y: Float[Array, "C N"], areas: Float[Array, " 
     rungs = jnp.asarray(np.arange(16) / 15, w.dtype)
     root = jnp.sqrt(areas)[:, None]
     target = y.T * root
-    ridge = 8 * count * float(jnp.finfo(w.dtype).eps)
+    ridge = jnp.asarray(8 * count * jnp.finfo(w.dtype).eps, w.dtype)
 
     def peel(columns, j):
         rest = target - columns @ _best_weights(columns, target, ridge)
@@ -189,7 +190,7 @@ def _peel(w: Float[Array, "N 3"], y: Float[Array, "C N"], areas: Float[Array, " 
     return GaussianLobes(z, sharpness, _best_weights(columns, target, ridge).T)
 
 
-def _best_weights(columns: Float[Array, "N m"], target: Float[Array, "N c"], ridge: float) -> Float[Array, "m c"]:
+def _best_weights(columns: Float[Array, "N m"], target: Float[Array, "N c"], ridge: Scalar) -> Float[Array, "m c"]:
     """Weights of least squares, of columns scaled to unit length plus `ridge`: they may be alike, or zero.
 
     Normal equations, three times faster than QR here, and one step of refinement for the digits they lose.

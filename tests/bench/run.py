@@ -22,7 +22,7 @@ from shisd.domains import _moments
 from shisd.domains._integrate import loop_coefficients
 from shisd.domains._polygon import loop_solid_angle
 from shisd.harmonics import _tables
-from tests.bench import equation_22, native, polygons
+from tests.bench import equation_22, lobes, native, polygons
 from tests.bench.timing import interleaved
 from tests.truth import scipy_basis, triangle_rule, zonal_moments
 
@@ -431,6 +431,7 @@ BENCHES = {
     "coefficients": bench_coefficients,
     "polygon_light": bench_polygon_light,
     "ridge": bench_ridge,
+    "lobes": lobes.compare,
 }
 
 
@@ -470,23 +471,28 @@ def main():
     if arguments.paste:
         return paste(arguments.paste[0], Path(arguments.paste[1]).read_text().rstrip())
     arguments.output.mkdir(parents=True, exist_ok=True)
-    results, sections = {}, []
+    results, sections = {}, {}
     for name in arguments.only or BENCHES:
         results[name] = BENCHES[name]()
-        sections.append(f"{BENCHES[name].__doc__}\n\n{table(results[name])}")
-        print(sections[-1], "\n", flush=True)
+        sections[name] = f"{BENCHES[name].__doc__}\n\n{table(results[name])}"
+        print(sections[name], "\n", flush=True)
         if name == "polygon_degree":
             cost_figure(results[name], arguments.output / "polygon_cost.png")
             if arguments.readme:
                 cost_figure(results[name], Path("examples/polygon_cost.png"))
+        if name == "lobes":
+            lobes.figure(results[name], arguments.output / "lobes.png")
+            if arguments.readme:  # a figure and a table of their own
+                lobes.figure(results[name], Path("examples/lobes.png"))
+                paste("lobes", f"{lobes.CAPTION}\n\n{table(lobes.summary(results[name]))}")
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
-    text = "\n\n".join([*sections, note])
     (arguments.output / "bench.json").write_text(json.dumps(results, indent=1))
-    (arguments.output / "bench.md").write_text(text + "\n")
-    if arguments.readme:
-        paste("bench", text)
+    (arguments.output / "bench.md").write_text("\n\n".join([*sections.values(), note]) + "\n")
+    sections.pop("lobes", None)
+    if arguments.readme and sections:
+        paste("bench", "\n\n".join([*sections.values(), note]))
 
 
 if __name__ == "__main__":

@@ -130,54 +130,53 @@ def test_a_fit_finds_axes_with_profiles(x64, rng):
 
 
 def test_the_weights_are_the_best_and_the_error_is_theirs(x64):
-    w, y, areas = samples(mixture(np.float64), np.float64, 20)
-    fit = decomposition.fit_lobes(decomposition.lobe_starts(w, y, areas, 1), w, y, areas)
+    w, y, areas = samples(mixture(np.float64), np.float64)
+    y = y + 0.1 * w[None, :, 2] ** 3  # so that something is left
+    fit = decomposition.fit_lobes(decomposition.lobe_starts(w, y, areas, 3, starts=3), w, y, areas)
     norm2 = lambda x: np.sum(np.asarray(x) ** 2 * np.asarray(areas))
     rest = np.asarray(y) - np.asarray(fit.lobes.evaluate(w))
     np.testing.assert_allclose(fit.error, np.sqrt(norm2(rest) / norm2(y)), rtol=1e-9)
-    column = np.asarray(fit.lobes.columns(w))[:, 0] * np.asarray(areas)
-    np.testing.assert_allclose(rest @ column / norm2(y), 0, atol=1e-12)
+    columns = np.asarray(fit.lobes.columns(w)) * np.asarray(areas)[:, None]
+    np.testing.assert_allclose(rest @ columns / norm2(y), 0, atol=1e-12)
 
 
 def test_more_starts_are_not_worse_and_fits_repeat(x64):
-    data = samples(mixture(np.float64), np.float64, 20)
-    starts = decomposition.lobe_starts(*data, 2, starts=4, key=jax.random.key(3))
-    assert len(starts) == 4
-    fits = [decomposition.fit_lobes(s, *data, max_steps=20) for s in (starts[:1], starts, starts)]
-    assert fits[1].error <= fits[0].error
-    for a, b in zip(jax.tree.leaves(fits[1]), jax.tree.leaves(fits[2]), strict=True):
+    data = samples(mixture(np.float64), np.float64)
+    starts = decomposition.lobe_starts(*data, 3, starts=3, key=jax.random.key(3))
+    one, all_, again = (decomposition.fit_lobes(s, *data) for s in (starts[1:2] * 3, starts, starts))
+    assert all_.error <= one.error
+    for a, b in zip(jax.tree.leaves(all_), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_a_ridge_keeps_lobes_from_cancelling(x64):
-    data = samples(mixture(np.float64, 1), np.float64, 20)
-    z = unit(AXES[[0, 0, 0]] + 0.05 * np.eye(3))
-    start = decomposition.GaussianLobes(jnp.asarray(z), jnp.asarray([3.0, 4.0, 6.0]), jnp.ones(3))
-    plain, ridged = (decomposition.fit_lobes(start, *data, max_steps=30, ridge=r) for r in (0.0, 1e-2))
-    assert np.abs(ridged.lobes.weights).sum() <= np.abs(plain.lobes.weights).sum() + 1e-9
-    assert ridged.error < 0.02
-    assert np.all(np.asarray(ridged.lobes.weights) > -0.1)
+    data = samples(mixture(np.float64, 1), np.float64)
+    z = jnp.asarray(unit(AXES[[0, 0, 0]] + 0.05 * np.eye(3)))
+    starts = [decomposition.GaussianLobes(z, jnp.asarray([3.0, 4.0, 6.0]), jnp.ones((2, 3)))] * 3
+    plain, ridged = (decomposition.fit_lobes(starts, *data, ridge=r) for r in (0.0, 1e-2))
+    size = lambda fit: np.abs(fit.lobes.weights[0]).sum()
+    assert size(ridged) <= size(plain) + 1e-6, (size(ridged), size(plain))
+    assert size(ridged) < 1.1 and ridged.error < 0.02  # of one lobe of weight 1
 
 
-def test_fits_inside_compiled_loops(dtype):
-    w, y, areas = samples(mixture(dtype, 1), dtype, 20)
+def test_fits_inside_compiled_loops(x64):
+    w, y, areas = samples(mixture(np.float64, 1), np.float64)
     fit = lambda y: decomposition.fit_lobes(decomposition.lobe_starts(w, y, areas, 1), w, y, areas).lobes.sharpness
     got = jax.jit(lambda y: jax.lax.map(fit, y))(jnp.stack([y, 2 * y]))
-    np.testing.assert_allclose(got, [[4.0], [4.0]], rtol=1e-6 if dtype == np.float64 else 5e-3)
+    np.testing.assert_allclose(got, [[4.0], [4.0]], rtol=1e-6)
 
 
 def test_statuses_say_what_to_try(x64):
-    data = samples(mixture(np.float64), np.float64, 20)
-    starts = decomposition.lobe_starts(*data, 3)
-    fit = decomposition.fit_lobes(starts, *data, max_steps=2)
+    w, y, areas = samples(mixture(np.float64), np.float64)
+    starts = decomposition.lobe_starts(w, y, areas, 3, starts=3)
+    fit = decomposition.fit_lobes(starts, w, y, areas, max_steps=2)
     assert fit.status == decomposition.FitStatus.step_limit
-    assert "max_steps" in decomposition.FitStatus[fit.status]
-    assert fit.error <= decomposition.fit_lobes(starts, *data, max_steps=1).error  # the best so far is kept
-    w, y, areas = data
+    assert "Raise `max_steps`" in decomposition.FitStatus[fit.status]
+    assert fit.error < 1  # the best so far is kept
     spike = jnp.zeros_like(y).at[:, 100].set(1.0)
-    fit = decomposition.fit_lobes(decomposition.lobe_starts(w, spike, areas, 1), w, spike, areas)
+    fit = decomposition.fit_lobes(decomposition.lobe_starts(w, spike, areas, 3, starts=3), w, spike, areas)
     assert fit.status == decomposition.FitStatus.degenerate
-    assert "fewer lobes" in decomposition.FitStatus[fit.status].replace("fewer \nlobes", "fewer lobes")
+    assert "narrower than the samples" in decomposition.FitStatus[fit.status]
 
 
 def test_wrong_shapes(as_user):
@@ -293,6 +292,7 @@ def picture_problem(rng, degree=8, views=6):
     return loss, (fitted.directions, jnp.log(fitted.sharpness), fitted.weights)
 
 
+@pytest.mark.slow
 def test_lobes_fitted_to_a_picture_lower_its_error(x64, rng):
     loss, start = picture_problem(rng)
     seen, unseen = slice(0, 100), slice(100, 200)
