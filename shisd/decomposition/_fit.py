@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float, Scalar
-from shisd.decomposition._mixtures import AbstractLobes, GaussianLobes, ZonalLobes
+from shisd.decomposition._mixtures import AbstractLobes, GaussianLobes
 
 
 class FitStatus(eqx.Enumeration):
@@ -150,8 +150,8 @@ def lobe_starts(
     subtracted. The second and further of `starts` are the first with axes moved by half a width and widths by a factor
     of about 2, at random from `key` (0 unless given).
 
-    Arguments: samples as in `fit_lobes`; static `count` and `starts`, at least 1. Widths lie between 1.4 rad and that of
-    one sample. Derivatives: none.
+    Arguments: samples as in `fit_lobes`; static `count` and `starts`, at least 1. Sharpness lies between 0.5 and
+    that of one sample, 2 pi over its solid angle. Derivatives: none.
     """
     w, y, areas = _samples(directions, values, solid_angles)
     count, starts = _checks.integer("count", count, 1), _checks.integer("starts", starts, 1)

@@ -1,4 +1,4 @@
-"""Weights on few of many axes: what greedy selection makes of an expansion (in the spirit of Nowrouzezahrai et al. 2012).
+"""Weights on few of many axes, chosen greedily: in the spirit of the few zonal lobes of Nowrouzezahrai et al. 2012.
 
 notation: M_l, lambda_l, c_l as in `_basis`.
 """
@@ -6,7 +6,6 @@ notation: M_l, lambda_l, c_l as in `_basis`.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 

@@ -11,6 +11,7 @@ Tables of Gaussians and profiles are interpolated linearly in elevation: axes, l
 The reference is quadrature over every texel of the map (`shisd.reference`), the maps 256 x 512.
 """
 
+import functools
 import time
 import warnings
 from pathlib import Path
