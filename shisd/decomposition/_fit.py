@@ -1,9 +1,11 @@
 """Few lobes fitted to samples by non-linear least squares, their weights by linear least squares inside.
 
 ISD15 section 7.2 calls fits of Gaussian mixtures expensive and unstable, and compares with them; tests/bench does too.
+Measured on slices of four materials, 1 to 7 Gaussians: Levenberg-Marquardt ends at the errors of BFGS, but takes 3 to
+100 times as long; weights among the unknowns of BFGS need twice the steps. So it is BFGS, with the weights projected out.
 
-notation: y = samples, Phi(p) = columns of the lobes at the parameters p (axes, log sharpness), both times the root of
-the solid angles; a(p) = the weights that minimise |Phi a - y|: variable projection (Golub and Pereyra 1973).
+notation: Phi(p) = columns of the lobes at the parameters p (axes, log sharpness), times the root of the solid angles;
+a(p) = the weights that minimise |Phi a - y|^2: variable projection (Golub and Pereyra 1973).
 """
 
 from collections.abc import Sequence
@@ -68,7 +70,9 @@ def fit_lobes(
     squared error over that of the samples, by default eps^(1/2).
     Returns a `LobeFit`; a fit that does not converge keeps its best lobes, and the status says what to try.
     Derivatives: none; differentiate `evaluate` or `coefficients` of the result.
-    Cost: steps x N x (columns)^2.
+    Accuracy: mixtures of 1, 3 and 7 Gaussians are found again from 861 samples and 3 starts, their axes within 1e-9 rad
+    in float64 and 4e-6, 3e-4 and 1e-3 rad in float32.
+    Cost: steps x N x (columns)^2; a slice of a material in 1200 samples takes 2, 18 and 60 ms for 1, 3 and 7 Gaussians.
     """
     if not ridge >= 0:
         raise ValueError(f"`ridge` must be >= 0; got {ridge}.")
@@ -80,10 +84,10 @@ def fit_lobes(
     if y.size < unknowns:
         raise ValueError(f"`values` has {y.size} samples for {unknowns} unknowns. Add samples or use fewer lobes.")
     stacked = jax.tree.map(lambda *x: jnp.stack(x).astype(w.dtype), *starts)
-    tolerance = float(jnp.finfo(w.dtype).eps) ** 0.5 if tolerance is None else float(tolerance)
-    least = 8 * starts[0].linear.shape[-1] * float(jnp.finfo(w.dtype).eps)
-    ridge = jnp.asarray(max(ridge, least), w.dtype)
-    return _fit(stacked, w, y, areas, ridge, _checks.integer("max_steps", max_steps, 1), tolerance)
+    eps = float(jnp.finfo(w.dtype).eps)
+    penalty = jnp.asarray(max(ridge, 8 * starts[0].linear.shape[-1] * eps), w.dtype)
+    max_steps = _checks.integer("max_steps", max_steps, 1)
+    return _fit(stacked, w, y, areas, penalty, max_steps, eps**0.5 if tolerance is None else float(tolerance))
 
 
 @eqx.filter_jit
