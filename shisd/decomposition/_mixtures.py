@@ -67,8 +67,8 @@ class GaussianLobes(AbstractLobes):
 
     Arguments: `directions` [J, 3], axes of any length but zero; `sharpness` [J] >= 0, the inverse square of a width in
     rad; `weights` [*colour, J], the value of each lobe at its axis. Colours share axes and widths.
-    Accuracy: coefficients 4e-14 and 2e-7 of each lobe's first one in float64 and float32, to degree 64 and sharpness
-    1e5; values of narrow lobes in float32 as good as their rounded axes.
+    Accuracy: coefficients 4e-14 and 1e-6 of each lobe's largest in float64 and float32, to degree 64 and sharpness 1e5;
+    values of narrow lobes in float32 as good as their rounded axes.
     Source: ISD15 Eq. 19 and section 7.2; Wang et al. 2009 (mixtures).
     """
 

@@ -308,5 +308,5 @@ def test_lobes_fitted_to_a_picture_lower_its_error(x64, rng):
     np.testing.assert_allclose(dot, (value(1e-5) - value(-1e-5)) / 2e-5, rtol=1e-5)
     found = optx.minimise(ours, optx.BFGS(1e-6, 1e-6), start, max_steps=40, throw=False).value
     before, after = (np.sqrt([loss(p, seen), loss(p, unseen)]) for p in (start, found))
-    assert after[0] < 0.5 * before[0], (before, after)
-    assert after[1] < 0.8 * before[1], (before, after)  # pixels that were not looked at
+    assert after[0] < 0.3 * before[0], (before, after)  # 8.4 % and 1.7 %
+    assert after[1] < 0.4 * before[1], (before, after)  # 6.4 % and 1.7 % at pixels that were not looked at
