@@ -33,8 +33,8 @@ class FitStatus(eqx.Enumeration):
         "The fit used up its steps; its best lobes are kept. Raise `max_steps` or `tolerance`, or give other starts."
     )
     coincident = (
-        "Two of the lobes are as good as one, from the start or by the fit: the result is that of fewer, or they cancel. "
-        "For zonal lobes opposite axes are one. Use fewer lobes, a `ridge`, or other starts (decomposition.lobe_starts)."
+        "Two lobes are as good as one, from the start or by the fit: the result is that of fewer, or they cancel. "
+        "Opposite axes of zonal lobes are one. Use fewer, a `ridge`, or other starts (decomposition.lobe_starts)."
     )
     degenerate = (
         "A lobe has become narrower than the samples are apart, or has no value at them, and means nothing. Use fewer "
