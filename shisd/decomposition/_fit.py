@@ -201,7 +201,7 @@ def _peel(w: Float[Array, "N 3"], y: Float[Array, "C N"], areas: Float[Array, " 
 def _best_weights(columns: Float[Array, "N m"], target: Float[Array, "N c"], ridge: Scalar) -> Float[Array, "m c"]:
     """Weights of least squares, of columns scaled to unit length plus `ridge`: they may be alike, or zero.
 
-    Normal equations, three times faster than QR here, and one step of refinement for the digits they lose.
+    Normal equations, faster than QR, and one step of refinement for the digits they lose.
     """
     norm = _lengths(columns)
     scaled = columns / norm[None]
