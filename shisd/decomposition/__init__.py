@@ -10,3 +10,14 @@ from shisd.decomposition._directions import low_discrepancy_directions as low_di
 from shisd.decomposition._directions import optimize_directions as optimize_directions
 from shisd.decomposition._directions import optimized_directions as optimized_directions
 from shisd.decomposition._directions import random_directions as random_directions
+from shisd.decomposition._directions import separate_directions as separate_directions
+from shisd.decomposition._isotropic import Decomposition as Decomposition
+from shisd.decomposition._isotropic import IsotropicBasis as IsotropicBasis
+from shisd.decomposition._kernels import AbstractKernel as AbstractKernel
+from shisd.decomposition._kernels import CapKernel as CapKernel
+from shisd.decomposition._kernels import FunctionKernel as FunctionKernel
+from shisd.decomposition._kernels import GaussianKernel as GaussianKernel
+from shisd.decomposition._kernels import GaussLegendreKernel as GaussLegendreKernel
+from shisd.decomposition._kernels import LegendreKernel as LegendreKernel
+from shisd.decomposition._kernels import PhongKernel as PhongKernel
+from shisd.decomposition._kernels import VonMisesFisherKernel as VonMisesFisherKernel
