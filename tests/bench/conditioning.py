@@ -127,31 +127,73 @@ def normalised(z):
     return z / jnp.linalg.norm(z, axis=-1, keepdims=True)
 
 
-def bench_kernels(degrees=(4, 8, 12, 16, 20), pictures=(8, 16)):
-    """Condition number of M for mother kernels of unit norm (ISD15 Fig. 13), and the error of a picture shaded so.
+def bench_kernels(degrees=(4, 8, 12, 16, 20)):
+    """Condition number of M, (L+1)^2 rows, for mother kernels of unit norm (ISD15 Fig. 13).
 
-    Picture: GGX of alpha 0.3 seen at 45 degrees from 200 sides, under the interior; error against sums in float64 with
-    SciPy's harmonics, relative to the RMS; refused: singular to working precision.
+    Axes: optimised ones that levels share, or separate ones; 2l+1 of them at level l, M square as in the paper, or all
+    2L+1 and weights of least norm.
+    """
+    rows = []
+    with jax.enable_x64(True):
+        for degree in degrees:
+            for name, kernel in KERNELS.items():
+                row = {"degree": degree, "kernel": name}
+                for layout, (make, nested) in LAYOUTS.items():
+                    basis = decomposition.IsotropicBasis(kernel, make(degree), degree, nested=nested)
+                    row[layout] = float(np.linalg.cond(np.asarray(_matrix(basis)).reshape((degree + 1) ** 2, -1)))
+                rows.append(row)
+            jax.clear_caches()
+    return rows
+
+
+def bench_kernel_pictures(degrees=(8, 16)):
+    """Error of a picture shaded with these kernels, float64 and float32: what the condition number does to it.
+
+    GGX of alpha 0.3 seen at 45 degrees from 200 sides, under the interior, by ISD15 Eq. 6; against sums in float64 with
+    SciPy's harmonics, relative to the RMS. Refused: singular to working precision.
     """
     rows = []
     for degree in degrees:
-        scene = picture(degree) if degree in pictures else None
-        for layout, (make, nested) in LAYOUTS.items():
-            for name, kernel in KERNELS.items():
-                row = {"degree": degree, "axes": layout, "kernel": name}
-                with jax.enable_x64(True):
-                    basis = decomposition.IsotropicBasis(kernel, make(degree), degree, nested=nested)
-                    m = np.asarray(_matrix(basis)).reshape((degree + 1) ** 2, -1)
-                    row["condition"] = float(np.linalg.cond(m))
-                for dtype in (np.float64, np.float32) if scene else ():
+        scene = picture(degree)
+        for name, kernel in KERNELS.items():
+            row = {"degree": degree, "kernel": name}
+            for layout, (make, nested) in LAYOUTS.items():
+                errors = []
+                for dtype in (np.float64, np.float32):
                     with jax.enable_x64(dtype == np.float64):
-                        row[f"picture, {dtype.__name__}"] = picture_error(kernel, make(degree), nested, scene, dtype)
-                rows.append(row)
-        jax.clear_caches()
+                        errors.append(picture_error(kernel, make(degree), nested, scene, dtype))
+                row[layout] = ", ".join(e if isinstance(e, str) else f"{e:.0e}" for e in errors)
+            rows.append(row)
+            jax.clear_caches()
     return rows
 
 
 _matrix = eqx.filter_jit(decomposition.IsotropicBasis.matrix)
+
+
+def kernels_figure(rows, path):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, panels = pyplot.subplots(1, len(LAYOUTS), figsize=(11, 3.1), sharey=True)
+    for panel, layout in zip(panels, LAYOUTS, strict=True):
+        for name in KERNELS:
+            chosen = [r for r in rows if r["kernel"] == name]
+            panel.semilogy(
+                [r["degree"] for r in chosen], [min(r[layout], 1e17) for r in chosen], "o-", ms=3, label=name
+            )
+        panel.axhline(1 / np.finfo(np.float32).eps, color="grey", lw=0.8, ls=":")
+        panel.axhline(1 / np.finfo(np.float64).eps, color="grey", lw=0.8, ls=":")
+        panel.set(title=f"axes {layout}", xlabel="degree L", ylim=(1, 3e17))
+    panels[0].set_ylabel("condition number of M")
+    panels[0].text(4, 1.5e7, "1/eps, float32", fontsize=7, color="grey")
+    panels[0].text(4, 7e15, "1/eps, float64", fontsize=7, color="grey", va="bottom")
+    panels[-1].legend(fontsize=7, loc="upper left")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
 
 
 def picture(degree):

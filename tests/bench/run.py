@@ -7,6 +7,7 @@ flags: default.
 """
 
 import argparse
+import inspect
 import json
 import os
 import subprocess
@@ -22,7 +23,7 @@ from shisd.domains import _moments
 from shisd.domains._integrate import loop_coefficients
 from shisd.domains._polygon import loop_solid_angle
 from shisd.harmonics import _tables
-from tests.bench import equation_22, native, polygons
+from tests.bench import conditioning, equation_22, native, polygons
 from tests.bench.timing import interleaved
 from tests.truth import scipy_basis, triangle_rule, zonal_moments
 
@@ -431,6 +432,14 @@ BENCHES = {
     "coefficients": bench_coefficients,
     "polygon_light": bench_polygon_light,
     "ridge": bench_ridge,
+    "directions": conditioning.bench_directions,
+    "objectives": conditioning.bench_objectives,
+    "kernels": conditioning.bench_kernels,
+    "kernel_pictures": conditioning.bench_kernel_pictures,
+}
+FIGURES = {
+    "polygon_degree": ("polygon_cost.png", cost_figure),
+    "kernels": ("conditioning.png", conditioning.kernels_figure),
 }
 
 
@@ -473,12 +482,13 @@ def main():
     results, sections = {}, []
     for name in arguments.only or BENCHES:
         results[name] = BENCHES[name]()
-        sections.append(f"{BENCHES[name].__doc__}\n\n{table(results[name])}")
+        sections.append(f"{inspect.cleandoc(BENCHES[name].__doc__)}\n\n{table(results[name])}")
         print(sections[-1], "\n", flush=True)
-        if name == "polygon_degree":
-            cost_figure(results[name], arguments.output / "polygon_cost.png")
+        if name in FIGURES:
+            file, draw = FIGURES[name]
+            draw(results[name], arguments.output / file)
             if arguments.readme:
-                cost_figure(results[name], Path("examples/polygon_cost.png"))
+                draw(results[name], Path("examples") / file)
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
