@@ -23,10 +23,10 @@ from shisd import harmonics, models
 DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 SEED = 20150801
 CAMERA = {"eye": 4.2 * np.array([np.cos(5.0), np.sin(5.0), 0.15]), "target": np.zeros(3), "degrees": 32.0}
-MATERIAL = {"alpha": np.array([0.45, 0.18]), "albedo": np.array([0.42, 0.16, 0.07]), "specular": np.array(0.45)}
+MATERIAL = {"alpha": np.array([0.45, 0.18]), "albedo": np.array([0.5, 0.25, 0.12]), "specular": np.array(0.4)}
 CLAY = {"alpha": np.array(0.35), "albedo": np.array(0.45), "specular": np.array(0.4)}
-LAMP = {"position": np.array([1.9, -1.2, 1.6]), "emission": np.array([9.0, 6.5, 3.5])}
-LAMP_SIZE = 1.1, 0.7  # width and height
+LAMP = {"position": np.array([1.1, -1.3, 1.9]), "emission": np.array([9.0, 6.5, 3.5])}
+LAMP_SIZE, LAMP_TURN = (1.2, 0.8), 0.4  # it faces straight down, turned about the vertical by so many radians
 
 
 def sky_light() -> np.ndarray:
@@ -38,13 +38,10 @@ def sky_light() -> np.ndarray:
 
 
 def lamp_outline() -> np.ndarray:
-    """Corners [4, 3] about the centre of a lamp that faces the origin, counter-clockwise seen from there."""
-    normal = -LAMP["position"] / np.linalg.norm(LAMP["position"])
-    right = np.cross([0.0, 0.0, 1.0], normal)
-    right /= np.linalg.norm(right)
-    up = np.cross(normal, right)
-    x, y = 0.5 * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * np.reshape(LAMP_SIZE, (2, 1))
-    return x[:, None] * right + y[:, None] * up
+    """Corners [4, 3] of the lamp about its centre, counter-clockwise seen from below."""
+    x, y = 0.5 * np.array([[-1, 1, 1, -1], [1, 1, -1, -1]]) * np.reshape(LAMP_SIZE, (2, 1))
+    cos, sin = np.cos(LAMP_TURN), np.sin(LAMP_TURN)
+    return np.stack([cos * x - sin * y, sin * x + cos * y, 0 * x], axis=1)
 
 
 def environment(mi, radiance, height: int) -> dict:
@@ -89,7 +86,7 @@ def scene(mi, name: str, size: int) -> dict:
     corners = lamp_outline() + LAMP["position"]
     to_world = np.eye(4)
     to_world[:3, 0], to_world[:3, 1] = (corners[1] - corners[0]) / 2, (corners[3] - corners[0]) / 2
-    to_world[:3, 2], to_world[:3, 3] = -LAMP["position"] / np.linalg.norm(LAMP["position"]), LAMP["position"]
+    to_world[:3, 2], to_world[:3, 3] = [0, 0, -1], LAMP["position"]
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": LAMP["emission"].tolist()}}
     whole["lamp"] = {"type": "rectangle", "to_world": mi.ScalarTransform4f(to_world), "emitter": emitter}
     return whole | {"ball": {"type": "sphere", "bsdf": material(mi, **CLAY)}}
