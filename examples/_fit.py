@@ -129,7 +129,9 @@ class LeastSquares:
                 path.append(np.asarray(y, float))
                 bar.set_postfix_str(f"loss {losses[-1]:.3g}")
                 bar.update()
-                converged, _ = self.solver.terminate(self.residuals, y, data, {}, state, frozenset())
+                # Near the optimum rounding decides whether the next step is accepted: one too small to matter ends it.
+                ahead = np.asarray(state.y_eval, float) - path[-1]
+                converged = np.all(np.abs(ahead) < self.solver.atol + self.solver.rtol * np.abs(path[-1]))
                 if converged:
                     break
         if not converged:
@@ -183,14 +185,14 @@ def sheet(path: Path, picture: Picture, fitted: np.ndarray, exposure: float, cur
     target, fit = (io.tonemap(np.nan_to_num(a), exposure=exposure) for a in (picture.image, picture.show(fitted)))
     style = {"text.color": ink, "font.size": 9, "axes.edgecolor": ink, "axes.labelcolor": ink, "axes.facecolor": paper}
     with pyplot.rc_context(style | {"xtick.color": ink, "ytick.color": ink}):
-        figure = pyplot.figure(figsize=(10.6, 2.85), facecolor=paper)
+        figure = pyplot.figure(figsize=(10.6, 2.9), facecolor=paper)
         titles = "picture (Mitsuba 3)", "fit", "difference / mean radiance"
         for k, (image, title) in enumerate(zip((target, fit, false), titles, strict=True)):
-            axes = figure.add_axes((0.01 + 0.225 * k, 0.07, 0.22, 0.82))
+            axes = figure.add_axes((0.01 + 0.225 * k, 0.085, 0.22, 0.82))
             axes.set_axis_off()
             axes.set_title(title)
             axes.imshow(image, interpolation="nearest")
-        scale = figure.add_axes((0.48, 0.09, 0.18, 0.03))
+        scale = figure.add_axes((0.483, 0.075, 0.175, 0.025))
         ramp = np.geomspace(BEST, WORST, 256)[None]
         ends = np.log10([BEST, WORST])
         scale.imshow(plotting.false_colour(ramp, limits=(BEST, WORST)), aspect="auto", extent=(*ends, 0, 1))

@@ -63,7 +63,7 @@ def cost(loss: Callable, parameters: jax.Array) -> str:
         compiled = jax.jit(function).lower(parameters).compile()
         seconds["compile"] = time.perf_counter() - start
         runs = []
-        for _ in range(3):
+        for _ in range(2):
             start = time.perf_counter()
             jax.block_until_ready(compiled(parameters))
             runs.append(time.perf_counter() - start)
