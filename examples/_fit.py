@@ -114,13 +114,15 @@ class LeastSquares:
         # By default steps grow only where the linear model is right to 1 %, which takes twice as many here.
         trust = optx.ClassicalTrustRegion(high_cutoff=0.75, high_constant=8.0)
         self.solver = eqx.tree_at(lambda s: s.search, solver, trust)
-        self.step = eqx.filter_jit(self.solver.step)
+        self.step, self.initial = eqx.filter_jit(self.solver.step), None
 
     def __call__(self, start: np.ndarray, data: jax.Array, *, steps: int, label: str) -> Fit:
         """The fit from one start. The best iterate is kept, also when `steps` run out: then this says what to try."""
         y = jnp.asarray(start, data.dtype)
-        shape = jax.ShapeDtypeStruct(jax.eval_shape(self.residuals, y, data)[0].shape, data.dtype)
-        state = self.solver.init(self.residuals, y, data, {}, shape, None, frozenset())
+        if self.initial is None:  # one for all fits: a second one would have `step` compiled again
+            shape = jax.eval_shape(self.residuals, y, data)[0]
+            self.initial = self.solver.init(self.residuals, y, data, {}, shape, None, frozenset())
+        state = eqx.tree_at(lambda s: s.y_eval, self.initial, y)
         losses, path, converged = [], [], False
         with tqdm(total=steps, desc=label) as bar:
             for _ in range(steps):
