@@ -18,7 +18,6 @@ from shisd import io, models, plotting
 
 # Pixels whose surface is seen at a flatter angle are left out: over these, four rays no longer make the mean.
 LEAST_FACING = 0.25
-WORST, BEST = 1e-1, 1e-3  # relative differences at the ends of the false-colour scale
 COLOURS = "#f2b134", "#ed553b", "#6fa8dc", "#8fd18f", "#c792ea", "#e8e6e3"
 
 
@@ -173,7 +172,14 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows([r.parameter, r.truth, r.found, r.error, *r.noisy] for r in rows)
 
 
-def sheet(path: Path, picture: Picture, fitted: np.ndarray, exposure: float, curves: dict[str, np.ndarray]) -> None:
+def sheet(
+    path: Path,
+    picture: Picture,
+    fitted: np.ndarray,
+    exposure: float,
+    curves: dict[str, np.ndarray],
+    limits: tuple[float, float],
+) -> None:
     """Target, fit, their difference, and the error of each parameter in per cent by step."""
     import matplotlib
 
@@ -183,7 +189,7 @@ def sheet(path: Path, picture: Picture, fitted: np.ndarray, exposure: float, cur
     ink, paper = "#e8e6e3", "#17181b"
     error = np.linalg.norm(fitted - picture.values, axis=1) / np.linalg.norm(picture.values, axis=1).mean()
     error = np.where(picture.used, picture.show(np.repeat(error[:, None], 3, axis=1))[..., 0], np.nan)
-    false = np.where(picture.used[..., None], plotting.false_colour(error, limits=(BEST, WORST)), 0)
+    false = np.where(picture.used[..., None], plotting.false_colour(error, limits=limits), 0)
     target, fit = (io.tonemap(np.nan_to_num(a), exposure=exposure) for a in (picture.image, picture.show(fitted)))
     style = {"text.color": ink, "font.size": 9, "axes.edgecolor": ink, "axes.labelcolor": ink, "axes.facecolor": paper}
     with pyplot.rc_context(style | {"xtick.color": ink, "ytick.color": ink}):
@@ -195,11 +201,12 @@ def sheet(path: Path, picture: Picture, fitted: np.ndarray, exposure: float, cur
             axes.set_title(title)
             axes.imshow(image, interpolation="nearest")
         scale = figure.add_axes((0.483, 0.075, 0.175, 0.025))
-        ramp = np.geomspace(BEST, WORST, 256)[None]
-        ends = np.log10([BEST, WORST])
-        scale.imshow(plotting.false_colour(ramp, limits=(BEST, WORST)), aspect="auto", extent=(*ends, 0, 1))
+        ramp = np.geomspace(*limits, 256)[None]
+        ends = np.log10(limits)
+        scale.imshow(plotting.false_colour(ramp, limits=limits), aspect="auto", extent=(*ends, 0, 1))
         scale.set_yticks([])
-        scale.set_xticks([-3, -2, -1], ["0.1 %", "1 %", "10 %"], fontsize=7)
+        decades = np.arange(*np.round(ends).astype(int) + [0, 1])
+        scale.set_xticks(decades, [f"{100 * 10.0**d:g} %" for d in decades], fontsize=7)
         scale.tick_params(length=0, pad=1)
         axes = figure.add_axes((0.735, 0.17, 0.255, 0.72))
         for (name, values), colour in zip(curves.items(), COLOURS, strict=False):
@@ -208,5 +215,5 @@ def sheet(path: Path, picture: Picture, fitted: np.ndarray, exposure: float, cur
         axes.grid(color=ink, alpha=0.15, linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=7.5, loc="upper right", labelcolor=ink)
-        figure.savefig(path, dpi=110, facecolor=paper)
+        figure.savefig(path, dpi=120, facecolor=paper)
         pyplot.close(figure)

@@ -102,8 +102,13 @@ def run(output: Path, size: int | None, steps: int, noisy: int) -> list[_fit.Row
         """In per cent: place over its distance, emission of each colour, light over its norm in each colour."""
         move = place(free) - true[0]
         light = np.linalg.norm(found[:16].T - true[2], axis=1) / np.linalg.norm(true[2], axis=1)
-        return 100 * np.concatenate([[np.linalg.norm(move)], np.abs(move), distance * np.abs(found[16] / true[1] - 1),
-                                     distance * light]) / distance
+        return (
+            100
+            * np.concatenate(
+                [[np.linalg.norm(move)], np.abs(move), distance * np.abs(found[16] / true[1] - 1), distance * light]
+            )
+            / distance
+        )
 
     best, (found, fitted) = fit(picture.values, "picture")
     others = []
@@ -126,7 +131,7 @@ def run(output: Path, size: int | None, steps: int, noisy: int) -> list[_fit.Row
     path = [errors(p, linear(p, picture.values)[0]) for p in best.path]
     curves = {"lamp's place": 0, "lamp, green": 5, "sky, green": 8}
     curves = {name: np.array([e[k] for e in path]) for name, k in curves.items()}
-    _fit.sheet(output / "fit_light.png", picture, fitted, 0.9 / np.percentile(picture.values, 99), curves)
+    _fit.sheet(output / "fit_light.png", picture, fitted, 0.9 / np.percentile(picture.values, 99), curves, (1e-4, 1e-2))
     return rows
 
 
@@ -136,8 +141,8 @@ def table(rows: list[_fit.Row]) -> str:
             _fit.table(rows),
             "",
             "Errors of the place are over its distance, that in the first line as a vector; sky: norm of the 16",
-            "coefficients of a colour, and that of their error. Last column: noise of 1 % of the picture's RMS added to",
-            f"every pixel; RMS of {len(rows[0].noisy)} seeds.",
+            "coefficients of a colour, and that of their error. Last column: noise of 1 % of the picture's RMS added",
+            f"to every pixel; RMS of {len(rows[0].noisy)} seeds.",
         ]
     )
 
@@ -145,7 +150,7 @@ def table(rows: list[_fit.Row]) -> str:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("output/fit_light"), help="folder for picture and table")
-    parser.add_argument("--size", type=int, default=32, help="width of the picture in pixels, a divisor of that stored")
+    parser.add_argument("--size", type=int, default=48, help="width of the picture in pixels, a divisor of that stored")
     parser.add_argument("--steps", type=int, default=25, help="most steps from one start")
     parser.add_argument("--noisy", type=int, default=2, help="fits to pictures with noise")
     parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")

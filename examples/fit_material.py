@@ -1,9 +1,9 @@
 """Find the roughness, anisotropy and colour of a material from one picture of a sphere under a known map.
 
-The picture is Mitsuba's (`examples/data/material.npz`): brushed metal under a matt colour, lit by a photographed studio.
-From six parameters to the loss everything is differentiable: BRDF -> slices by view -> spherical harmonics -> weights on
-rotated zonal harmonics -> picture -> loss. The fit starts from a rough, grey, isotropic material, first with lobes of
-degree 8, which is quick, and from there with --degree. It never sees the truth, which is stored for comparison.
+The picture is Mitsuba's (`examples/data/material.npz`): a brushed gloss on a matt colour, lit by a photographed studio.
+From six parameters to the loss everything is differentiable: BRDF -> slices by view -> spherical harmonics -> weights
+on rotated zonal harmonics -> picture -> loss. The fit starts from a rough, grey, isotropic material, first with lobes
+of degree 8, which is quick, and from there with --degree. It never sees the truth, which is stored for comparison.
 Writes a picture and a table to --output.
 
     python examples/fit_material.py --output output/fit_material
@@ -105,7 +105,9 @@ def run(output: Path, size: int | None, degree: int, steps: int, noisy: int) -> 
     curves = dict(zip(names, np.array([error(p) for p in path]).T, strict=True))
     curves = {name.replace("albedo, ", ""): curves[name] for name in ("roughness", "anisotropy", *NAMES[2:])}
     fitted = np.asarray(images[degree](jnp.log(jnp.asarray(found, jnp.float32))))
-    _fit.sheet(output / "fit_material.png", picture, fitted, 0.9 / np.percentile(picture.values, 99), curves)
+    _fit.sheet(
+        output / "fit_material.png", picture, fitted, 0.9 / np.percentile(picture.values, 99), curves, (1e-3, 1e-1)
+    )
     return rows, report
 
 
@@ -114,8 +116,8 @@ def table(rows: list[_fit.Row], degree: int) -> str:
         [
             _fit.table(rows),
             "",
-            f"Degree {degree}. Roughness is sqrt(alpha_x alpha_y), anisotropy alpha_x / alpha_y. Last column: noise of 1 %",
-            f"of the picture's RMS added to every pixel; RMS of {len(rows[0].noisy)} seeds.",
+            f"Degree {degree}. Roughness is sqrt(alpha_x alpha_y), anisotropy alpha_x / alpha_y. Last column: noise of",
+            f"1 % of the picture's RMS added to every pixel; RMS of {len(rows[0].noisy)} seeds.",
         ]
     )
 

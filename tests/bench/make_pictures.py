@@ -59,7 +59,13 @@ def material(mi, alpha: np.ndarray, albedo: np.ndarray, specular: np.ndarray) ->
     """Lambertian + specular GGX without Fresnel, as a blend of the two, ordered by name. `alpha` is a scalar or [2]."""
     colour = lambda value: {"type": "rgb", "value": np.broadcast_to(value, 3).tolist()}
     u, v = np.broadcast_to(alpha, 2)
-    ggx = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha_u": float(u), "alpha_v": float(v)}
+    ggx = {
+        "type": "roughconductor",
+        "material": "none",
+        "distribution": "ggx",
+        "alpha_u": float(u),
+        "alpha_v": float(v),
+    }
     matt = {"type": "diffuse", "reflectance": colour(albedo / (1 - specular))}
     return {"type": "blendbsdf", "weight": float(specular), "bsdf_0": matt, "bsdf_1": ggx}
 
@@ -126,7 +132,12 @@ def main() -> None:
         picture, noise = render(name, options.size, options.samples, options.passes, options.variant)
         truth = MATERIAL if name == "material" else {**LAMP, "light": sky_light()}
         known = {} if name == "material" else {"outline": lamp_outline(), **CLAY}
-        made = {"samples": options.samples * options.passes, "seed": SEED, "noise": noise, "mitsuba": mitsuba.__version__}
+        made = {
+            "samples": options.samples * options.passes,
+            "seed": SEED,
+            "noise": noise,
+            "mitsuba": mitsuba.__version__,
+        }
         held = {"picture": picture.astype(np.float32), **CAMERA, **known, **made}
         np.savez_compressed(path, **held, **{f"truth_{key}": value for key, value in truth.items()})
         print(f"{path}: noise {100 * noise:.2g} %, {path.stat().st_size} bytes, {time.perf_counter() - start:.0f} s")
