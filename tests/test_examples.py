@@ -86,7 +86,7 @@ def test_fit_material_finds_the_material(tmp_path):
         assert abs(float(row["found"]) / float(row["truth"]) - 1) < 0.02, row
         assert float(row["noisy 0"]) < 2, row
     ratio = float(re.search(r"takes ([\d.]+) times the forward pass", done.stdout)[1])
-    assert 1 < ratio < 5
+    assert 1 < ratio < 8  # about 2.3 where nothing else runs
     refused = python(*command)
     assert refused.returncode != 0 and "exists" in refused.stderr
 
