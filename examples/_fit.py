@@ -212,8 +212,9 @@ def sheet(
         for (name, values), colour in zip(curves.items(), COLOURS, strict=False):
             axes.semilogy(np.arange(len(values)), values, label=name, color=colour, linewidth=1.3)
         axes.set_title("error % by step")
+        axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(color=ink, alpha=0.15, linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False, fontsize=7.5, loc="upper right", labelcolor=ink)
+        axes.legend(frameon=False, fontsize=7.5, loc="lower left", labelcolor=ink)
         figure.savefig(path, dpi=120, facecolor=paper)
         pyplot.close(figure)
