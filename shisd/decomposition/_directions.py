@@ -53,7 +53,7 @@ def separate_directions(degree: int, *, dtype: DTypeLike = float) -> Float[Array
 
     Arguments: static `degree`. Returns unit vectors [L+1, 2L+1, 3] over the whole sphere, in `dtype` (default: JAX's
     float): one sequence of Halton points, cut into runs of 2L+1, so that the first 2l+1 of a level are spread as well.
-    Condition number of M at degree 20, unit-norm Gaussians: 69; 3e4 if only 2l+1 serve level l; 1e8 if levels share.
+    Condition number of M at degree 20, Gaussians: 69; 2e4 if only 2l+1 axes serve level l; 1e10 if levels share them.
     """
     levels, count = _checks.degree(degree) + 1, 2 * degree + 1
     i = np.arange(1, levels * count + 1)
@@ -145,7 +145,8 @@ def optimize_directions(
     Returns unit vectors [K, 3] in the same order, hemispheres not restored. Work in float64 for the last digits.
     A singular start, whose loss is not finite, comes back as it is: the basis refuses it with a clear message.
     Derivatives: none are meant; differentiate `conditioning_loss`.
-    Cost: degree 20 from a random start 3 s, degree 64 a minute, measured on two cores.
+    Cost: at each step the eigenvalues of a K x K matrix for every band; seconds at degree 20 (`make bench` reports them),
+    about a minute at degree 64.
     """
     starts = _checks.vectors("directions", directions)
     several = starts.ndim == 3 and len(starts) > 0
@@ -154,11 +155,11 @@ def optimize_directions(
         raise ValueError(f"`mirror` must be None, 'x', 'y' or 'z'; got {mirror!r}.")
     if mirror is not None and starts.shape[-2] % 2 == 0:
         raise ValueError(f"`mirror` needs an odd number of axes: one in the plane, and pairs; got {starts.shape[-2]}.")
-    powers = jnp.asarray(powers, dtype=starts.dtype)
-    steps = _checks.integer("max_steps", max_steps, 1)
-    plane = None if mirror is None else "xyz".index(mirror)
+    steps, plane = _checks.integer("max_steps", max_steps, 1), None if mirror is None else "xyz".index(mirror)
     starts = normalize(starts if several else starts[None])
-    return _minimise(starts, powers, degree, steps, bool(nested), _bands(bands, degree), plane)
+    return _minimise(
+        starts, jnp.asarray(powers, dtype=starts.dtype), degree, steps, bool(nested), _bands(bands, degree), plane
+    )
 
 
 @eqx.filter_jit
