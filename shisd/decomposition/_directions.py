@@ -145,8 +145,7 @@ def optimize_directions(
     Returns unit vectors [K, 3] in the same order, hemispheres not restored. Work in float64 for the last digits.
     A singular start, whose loss is not finite, comes back as it is: the basis refuses it with a clear message.
     Derivatives: none are meant; differentiate `conditioning_loss`.
-    Cost: at each step the eigenvalues of a K x K matrix for every band; seconds at degree 20 (`make bench` reports them),
-    about a minute at degree 64.
+    Cost: at each step the eigenvalues of a K x K matrix for every band; `make bench` reports the time.
     """
     starts = _checks.vectors("directions", directions)
     several = starts.ndim == 3 and len(starts) > 0
