@@ -23,7 +23,7 @@ from shisd.domains import _moments
 from shisd.domains._integrate import loop_coefficients
 from shisd.domains._polygon import loop_solid_angle
 from shisd.harmonics import _tables
-from tests.bench import conditioning, equation_22, native, polygons
+from tests.bench import conditioning, equation_22, lobes, native, polygons
 from tests.bench.timing import interleaved
 from tests.truth import scipy_basis, triangle_rule, zonal_moments
 
@@ -436,11 +436,18 @@ BENCHES = {
     "objectives": conditioning.bench_objectives,
     "kernels": conditioning.bench_kernels,
     "kernel_pictures": conditioning.bench_kernel_pictures,
+    "lobes": lobes.compare,
 }
 FIGURES = {
     "polygon_degree": ("polygon_cost.png", cost_figure),
     "kernels": ("conditioning.png", conditioning.kernels_figure),
+    "lobes": ("lobes.png", lobes.figure),
 }
+README = {  # markers, and the benchmarks whose tables stand between them
+    "conditioning": ("directions", "objectives", "kernels", "kernel_pictures"),
+    "lobes": ("lobes",),
+}
+README["bench"] = tuple(name for name in BENCHES if not any(name in names for names in README.values()))
 
 
 def table(rows):
@@ -479,11 +486,12 @@ def main():
     if arguments.paste:
         return paste(arguments.paste[0], Path(arguments.paste[1]).read_text().rstrip())
     arguments.output.mkdir(parents=True, exist_ok=True)
-    results, sections = {}, []
+    results, sections = {}, {}
     for name in arguments.only or BENCHES:
         results[name] = BENCHES[name]()
-        sections.append(f"{inspect.cleandoc(BENCHES[name].__doc__)}\n\n{table(results[name])}")
-        print(sections[-1], "\n", flush=True)
+        shown = lobes.summary(results[name]) if name == "lobes" else results[name]
+        sections[name] = f"{inspect.cleandoc(BENCHES[name].__doc__)}\n\n{table(shown)}"
+        print(sections[name], "\n", flush=True)
         if name in FIGURES:
             file, draw = FIGURES[name]
             draw(results[name], arguments.output / file)
@@ -492,11 +500,11 @@ def main():
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
-    text = "\n\n".join([*sections, note])
     (arguments.output / "bench.json").write_text(json.dumps(results, indent=1))
-    (arguments.output / "bench.md").write_text(text + "\n")
-    if arguments.readme:
-        paste("bench", text)
+    (arguments.output / "bench.md").write_text("\n\n".join([*sections.values(), note]) + "\n")
+    for marker, names in README.items() if arguments.readme else ():
+        if all(name in sections for name in names):
+            paste(marker, "\n\n".join([*(sections[name] for name in names), note]))
 
 
 if __name__ == "__main__":
