@@ -11,10 +11,10 @@ from shisd.decomposition._directions import optimize_directions as optimize_dire
 from shisd.decomposition._directions import optimized_directions as optimized_directions
 from shisd.decomposition._directions import random_directions as random_directions
 from shisd.decomposition._directions import separate_directions as separate_directions
-from shisd.decomposition._fit import fit_lobes as fit_lobes
 from shisd.decomposition._fit import FitStatus as FitStatus
-from shisd.decomposition._fit import lobe_starts as lobe_starts
 from shisd.decomposition._fit import LobeFit as LobeFit
+from shisd.decomposition._fit import fit_lobes as fit_lobes
+from shisd.decomposition._fit import lobe_starts as lobe_starts
 from shisd.decomposition._isotropic import Decomposition as Decomposition
 from shisd.decomposition._isotropic import IsotropicBasis as IsotropicBasis
 from shisd.decomposition._kernels import AbstractKernel as AbstractKernel
