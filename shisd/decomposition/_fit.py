@@ -32,6 +32,10 @@ class FitStatus(eqx.Enumeration):
     step_limit = (
         "The fit used up its steps; its best lobes are kept. Raise `max_steps` or `tolerance`, or give other starts."
     )
+    coincident = (
+        "Two lobes are as good as one, from the start or by the fit: the result is that of fewer, or they cancel. "
+        "Opposite axes of zonal lobes are one. Use fewer, a `ridge`, or other starts (decomposition.lobe_starts)."
+    )
     degenerate = (
         "A lobe has become narrower than the samples are apart, or has no value at them, and means nothing. Use fewer "
         "lobes, more samples, a `ridge`, or other starts (decomposition.lobe_starts)."
@@ -134,6 +138,7 @@ def _fit(
     columns = lobes.columns(w) * root
     weights = _best_weights(columns, target, ridge)
     seen_by = jnp.sum(columns**2, axis=0) ** 2 / jnp.sum(columns**4, axis=0)  # samples, or NaN
+    status = FitStatus.where(_coincide(lobes), FitStatus.coincident, status)
     status = FitStatus.where(jnp.all(seen_by > 1.5), status, FitStatus.degenerate)
     lobes = lobes.with_linear((scale * weights.T).reshape(*y.shape[:-1], -1))
     return LobeFit(lobes, jnp.sqrt(error2(columns, weights)), jnp.sum(steps), status)
@@ -155,7 +160,7 @@ def lobe_starts(
     of about 2, at random from `key` (0 unless given).
 
     Arguments: samples as in `fit_lobes`; static `count` and `starts`, at least 1. Sharpness lies between 0.5 and
-    that of one sample, 2 pi over its solid angle. Derivatives: none.
+    that of the highest sample, 2 pi over its solid angle. Derivatives: none.
     """
     w, y, areas = _samples(directions, values, solid_angles)
     count, starts = _checks.integer("count", count, 1), _checks.integer("starts", starts, 1)
@@ -173,17 +178,16 @@ def lobe_starts(
 
 @eqx.filter_jit
 def _peel(w: Float[Array, "N 3"], y: Float[Array, "C N"], areas: Float[Array, " N"], count: int) -> GaussianLobes:
-    rungs = jnp.asarray(np.arange(16) / 15, w.dtype)
     root = jnp.sqrt(areas)[:, None]
     target = y.T * root
+    peak = areas[jnp.argmax(jnp.where(areas > 0, jnp.sum(y * y, axis=0), 0))]
+    widths = 0.5 * jnp.maximum(4 * np.pi / peak, 2) ** jnp.asarray(np.arange(16) / 15, w.dtype)
     ridge = jnp.asarray(8 * count * jnp.finfo(w.dtype).eps, w.dtype)
 
     def peel(columns, j):
         rest = target - columns @ _best_weights(columns, target, ridge)
         top = jnp.argmax(jnp.sum(rest * rest, axis=1) / jnp.maximum(areas, jnp.finfo(w.dtype).tiny))
-        narrowest = jnp.maximum(2 * np.pi / areas[top], 1.0)
-        # a hair wider each time, so that no two lobes are one
-        ladder = 0.5 * (2 * narrowest) ** rungs * (1 + j.astype(w.dtype) / 64)
+        ladder = widths * (1 + j.astype(w.dtype) / (32 * count))  # a hair apart, so that no two lobes are ever one
         shapes = GaussianLobes(jnp.tile(w[top], (16, 1)), ladder, jnp.ones_like(ladder)).columns(w) * root  # [N, 16]
         match = jnp.sum((shapes.T @ rest) ** 2, axis=1) / jnp.sum(shapes * shapes, axis=0)
         k = jnp.argmax(match)
@@ -254,18 +258,20 @@ def _check_starts(starts: Sequence[AbstractLobes]) -> None:
 
 
 def _checked_start(lobes: AbstractLobes) -> AbstractLobes:
-    """An error for starts from which no fit gets away: lobes that are one and the same stay so."""
-    z = normalize(lobes.directions)
-    cosine = jnp.einsum("ic,jc->ij", z, z)
+    wrong = ~jnp.all(jnp.isfinite(normalize(lobes.directions)))
     if isinstance(lobes, GaussianLobes):
-        same_width = jnp.abs(lobes.sharpness[:, None] / lobes.sharpness[None] - 1) < 1e-3
-        twins, what = (cosine > 1 - 1e-6) & same_width, "two lobes of equal axis and sharpness"
-        wrong = ~jnp.all((lobes.sharpness > 0) & jnp.isfinite(lobes.sharpness))
+        wrong |= ~jnp.all((lobes.sharpness > 0) & jnp.isfinite(lobes.sharpness))
+    message = "`start` has an axis that is zero or not finite, or a sharpness that is not positive."
+    return eqx.tree_at(lambda x: x.directions, lobes, eqx.error_if(lobes.directions, wrong, message))
+
+
+def _coincide(lobes: AbstractLobes) -> Array:
+    """Whether two lobes are one and the same, within a hundredth of their width: they move as one, or cancel."""
+    z = lobes.directions
+    apart2 = lambda sign: jnp.sum((z[:, None] - sign * z[None]) ** 2, axis=-1)
+    if isinstance(lobes, GaussianLobes):
+        k = lobes.sharpness[:, None]
+        twins = (apart2(1) * k < 1e-4) & (jnp.abs(k / k.T - 1) < 1e-2)
     else:
-        twins, what = jnp.abs(cosine) > 1 - 1e-6, "two axes that are equal or opposite, which is the same"
-        wrong = jnp.zeros((), bool)
-    wrong |= ~jnp.all(jnp.isfinite(z))
-    twins = jnp.any(twins & ~np.eye(len(z), dtype=bool))
-    z = eqx.error_if(z, twins, f"`start` has {what}: they would move as one. Use lobe_starts, or move one.")
-    z = eqx.error_if(z, wrong, "`start` has an axis that is zero or not finite, or a sharpness that is not positive.")
-    return eqx.tree_at(lambda x: x.directions, lobes, z)
+        twins = jnp.minimum(apart2(1), apart2(-1)) < 1e-4
+    return jnp.any(twins & ~np.eye(len(z), dtype=bool))

@@ -365,6 +365,7 @@ def compare(names=None):
     for material, brdf in materials().items():
         if names and material not in names:
             continue
+        begun = time.perf_counter()
         truth = {
             name: np.asarray(reference.shade_environment_quadrature(brdf, light["environment"], *few, supersampling=1))
             for name, light in lights.items()
@@ -386,6 +387,7 @@ def compare(names=None):
                 "first call s": times[method].first,
             }
             rows.append(row)
+        print(f"{material}: {time.perf_counter() - begun:.0f} s", flush=True)
     return rows
 
 
