@@ -39,13 +39,18 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def camera_rays(size: int, eye: np.ndarray, target: np.ndarray, field_of_view: float) -> np.ndarray:
-    """Unit rays [size, size, 3] of a perspective camera with +z up; rows from the top, one ray per pixel centre."""
+def camera_rays(
+    size: int, eye: np.ndarray, target: np.ndarray, field_of_view: float, right_down: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
+    """Unit rays [size, size, 3] of a perspective camera with +z up; rows from the top, one ray per pixel.
+
+    Rays go through the centres, or through points to the right of them and below by so many pixels.
+    """
     forward = unit(target - eye)
     right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
     up = np.cross(right, forward)
-    t = np.tan(field_of_view / 2) * (2 * (np.arange(size) + 0.5) / size - 1)
-    return unit(forward + t[None, :, None] * right - t[:, None, None] * up)
+    x, y = (np.tan(field_of_view / 2) * (2 * (np.arange(size) + 0.5 + shift) / size - 1) for shift in right_down)
+    return unit(forward + x[None, :, None] * right - y[:, None, None] * up)
 
 
 def _view(rays: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> View:

@@ -68,6 +68,69 @@ def test_area_lights_writes_pictures_and_a_table(tmp_path):
     assert refused.returncode != 0 and "exists" in refused.stderr
 
 
+def fitted(output):
+    with next(output.glob("*.csv")).open() as file:
+        return {row["parameter"]: row for row in csv.DictReader(file)}
+
+
+@pytest.mark.slow
+def test_fit_material_finds_the_material(tmp_path):
+    output = tmp_path / "fit_material"
+    command = [ROOT / "examples/fit_material.py", "--output", output]
+    done = python(*command, "--size", 48, "--degree", 16, "--noisy", 1)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (output / "fit_material.md").read_text() in done.stdout and (output / "fit_material.png").exists()
+    rows = fitted(output)
+    assert {"roughness", "anisotropy", "albedo, blue", "specular"} < set(rows)
+    for row in rows.values():
+        assert abs(float(row["found"]) / float(row["truth"]) - 1) < 0.02, row
+        assert float(row["noisy 0"]) < 2, row
+    ratio = float(re.search(r"takes ([\d.]+) times the forward pass", done.stdout)[1])
+    assert 1 < ratio < 8  # about 2.3 where nothing else runs
+    refused = python(*command)
+    assert refused.returncode != 0 and "exists" in refused.stderr
+
+
+@pytest.mark.slow
+def test_fit_light_finds_the_lamp(tmp_path):
+    output = tmp_path / "fit_light"
+    done = python(ROOT / "examples/fit_light.py", "--output", output, "--size", 24, "--noisy", 0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (output / "fit_light.md").read_text() in done.stdout and (output / "fit_light.png").exists()
+    rows = fitted(output)
+    move = [float(rows[axis]["found"]) - float(rows[axis]["truth"]) for axis in "xyz"]
+    assert sum(x * x for x in move) ** 0.5 < 0.01 * float(rows["distance"]["truth"]), rows
+    for name in ("lamp, red", "lamp, blue", "sky, red", "sky, blue"):
+        assert float(rows[name]["error %"]) < 2, rows[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["material", "light"])
+def test_the_stored_pictures_are_those_of_mitsuba(name):
+    """Rendered again, small and with few samples: the same within its noise, also in the mean, which has less."""
+    pytest.importorskip("mitsuba")
+    code = f"""
+import numpy as np
+from tests.bench.make_pictures import DATA, render
+picture, noise = render({name!r}, 24, 256, 8)
+stored = np.load(DATA / "{name}.npz")["picture"].astype(float).reshape(24, 4, 24, 4, 3).mean(axis=(1, 3))
+rms = np.sqrt(np.mean(stored**2))
+print(np.sqrt(np.mean((picture - stored) ** 2)) / rms, noise, abs(np.mean(picture) / np.mean(stored) - 1))
+"""
+    done = python("-c", code)
+    assert done.returncode == 0, done.stderr
+    difference, noise, mean = map(float, done.stdout.split())
+    assert noise < 0.01 and 0.5 * noise < difference < 1.5 * noise, (difference, noise)
+    assert mean < 5 * noise / 24, (mean, noise)
+
+
+def test_pictures_are_not_overwritten(tmp_path):
+    (tmp_path / "light.npz").write_bytes(b"keep me")
+    refused = python("-m", "tests.bench.make_pictures", tmp_path, "--only", "light")
+    assert refused.returncode != 0 and "exists" in refused.stderr
+    assert (tmp_path / "light.npz").read_bytes() == b"keep me"
+
+
 @pytest.mark.slow
 def test_the_code_of_the_readme_runs():
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)

@@ -65,19 +65,8 @@ class RotatedZonalBasis(eqx.Module):
         Coefficients come back within 10 eps sqrt(K) times the norm of a band's weights.
         Cost: L+1 QR decompositions of K x (2L+1); batches of coefficients share them.
         """
-        c, given = _checks.coefficients("coefficients", coefficients)
-        if given != self.degree:
-            raise ValueError(
-                f"`coefficients` must be of the basis' degree {self.degree}, {(self.degree + 1) ** 2} numbers on the "
-                f"last axis; got {list(c.shape)}, degree {given}. Truncate or pad with zeros."
-            )
-        m = self._matrices()
-        c, m = _same_dtype(c, m)
-        index, mask = _padding(self.degree)
-        padded = jnp.where(mask, c[..., index], 0)  # [*batch, L+1, 2L+1]
-        columns = jnp.moveaxis(padded.reshape(-1, *mask.shape), 0, -1)  # [L+1, 2L+1, batch]
-        weights = _minimum_norm(m, columns, mask)
-        return jnp.moveaxis(weights, -1, 0).reshape(*c.shape[:-1], self.degree + 1, self.size)
+        c, m = same_dtype(check_coefficients(coefficients, self.degree), self._matrices())
+        return weights_by_band(m, c, self.degree)
 
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
         """SH coefficients of a weighted sum, the inverse of `weights`: c_l = M_l lambda_l (ISD15 Eq. 10).
@@ -85,10 +74,9 @@ class RotatedZonalBasis(eqx.Module):
         Arguments: `weights` [..., L+1, K]. Returns [..., (L+1)^2]. A nested basis ignores the weights of axes that a
         band does not use, in `evaluate` too.
         """
-        m = self._matrices()
-        weights, m = _same_dtype(self._checked(weights), m)
+        weights, m = same_dtype(check_weights(weights, self.degree, self.size), self._matrices())
         c = jnp.einsum("lmk,...lk->...lm", m, weights, precision="highest")
-        _, mask = _padding(self.degree)
+        _, mask = padding(self.degree)
         return c[..., mask]
 
     def evaluate(self, weights: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
@@ -99,15 +87,15 @@ class RotatedZonalBasis(eqx.Module):
         Cost: directions x K x L, without a stored basis.
         Source: Clenshaw's summation of the recurrence DLMF 14.10.3.
         """
-        weights, axes = _same_dtype(self._checked(weights), self._axes())
-        w, axes = _same_dtype(normalize(_checks.vectors("directions", directions)), axes)
+        weights, axes = same_dtype(check_weights(weights, self.degree, self.size), unit_axes(self.directions))
+        w, axes = same_dtype(normalize(_checks.vectors("directions", directions)), axes)
         x = jnp.einsum("...i,ki->...k", w, axes, precision="highest")
         shape = jnp.broadcast_shapes(x.shape, (*weights.shape[:-2], self.size))
         x = jnp.broadcast_to(x, shape)
         # sum_l a_l P_l(x) = b_0,  b_l = a_l + (2l+1)/(l+1) x b_{l+1} - (l+1)/(l+2) b_{l+2}
         b, after = jnp.zeros_like(x), jnp.zeros_like(x)
         for l in range(self.degree, -1, -1):
-            a = jnp.broadcast_to(weights[..., l, :], shape) / _pi(self.degree)[l].item()
+            a = jnp.broadcast_to(weights[..., l, :], shape) / pi(self.degree)[l].item()
             if self.nested:
                 a = jnp.where(jnp.broadcast_to(np.arange(self.size) <= 2 * l, shape), a, 0)
             b, after = a + (2 * l + 1) / (l + 1) * x * b - (l + 1) / (l + 2) * after, b
@@ -123,53 +111,61 @@ class RotatedZonalBasis(eqx.Module):
         bands = np.arange(self.degree + 1)
         return s[:, 0] / s[bands, 2 * bands]
 
-    def _axes(self) -> Float[Array, "K 3"]:
-        """Unit axes, also after an optimiser has moved the field."""
-        z = normalize(self.directions)
-        message = "`directions` of the basis has a vector that is zero or not finite. Pass unit axes."
-        return eqx.error_if(z, ~jnp.all(jnp.isfinite(z)), message)
-
     def _matrices(self) -> Float[Array, "{self.degree}+1 2*{self.degree}+1 {self.size}"]:
         """M_l of all bands, stacked; zero in rows beyond the 2l+1 of a band and in columns of axes it does not use."""
-        index, mask = _padding(self.degree)
-        y = sh_basis(self._axes(), self.degree)
-        m = jnp.moveaxis(y, 0, -1)[index] * jnp.asarray(_pi(self.degree), dtype=y.dtype)[:, None, None]
+        index, mask = padding(self.degree)
+        y = sh_basis(unit_axes(self.directions), self.degree)
+        m = jnp.moveaxis(y, 0, -1)[index] * jnp.asarray(pi(self.degree), dtype=y.dtype)[:, None, None]
         used = mask[:, :, None]
         if self.nested:
             used = used & (np.arange(self.size) <= 2 * np.arange(self.degree + 1)[:, None])[:, None, :]
         return jnp.where(used, m, 0)
 
-    def _checked(self, weights: ArrayLike) -> Float[Array, "*batch {self.degree}+1 {self.size}"]:
-        weights = _checks.real_array("weights", weights)
-        if weights.shape[-2:] != (self.degree + 1, self.size):
-            raise ValueError(
-                f"`weights` must have shape [..., degree + 1, K] = [..., {self.degree + 1}, {self.size}]; got "
-                f"{list(weights.shape)}."
-            )
-        return weights
+
+def weights_by_band(
+    m: Float[Array, "bands n K"], c: Float[Array, "*batch coefs"], degree: int, ridge: float = 0.0
+) -> Float[Array, "*batch bands K"]:
+    """Weights of least norm for matrices M_l that are stacked and padded as `padding` says."""
+    index, mask = padding(degree)
+    padded = jnp.where(mask, c[..., index], 0)  # [*batch, L+1, 2L+1]
+    columns = jnp.moveaxis(padded.reshape(-1, *mask.shape), 0, -1)  # [L+1, 2L+1, batch]
+    weights = minimum_norm(m, columns, mask, [_unresolved(l) for l in range(degree + 1)], ridge)
+    return jnp.moveaxis(weights, -1, 0).reshape(*c.shape[:-1], *weights.shape[:-1])
 
 
-def _minimum_norm(
-    m: Float[Array, "bands n K"], c: Float[Array, "bands n batch"], mask: np.ndarray
+def minimum_norm(
+    m: Float[Array, "bands n K"],
+    c: Float[Array, "bands n batch"],
+    mask: np.ndarray,
+    unresolved: list[str],
+    ridge: float = 0.0,
 ) -> Float[Array, "bands K batch"]:
     """x of least norm with m x = c in every band, for right-hand sides that are zero outside `mask` [bands, n].
 
-    notation: m^T = q r, x = q r^-T c. Padding columns of m^T get a row of their own with a one in it: that keeps full
-    rank, as derivatives of QR need, and leaves the columns in use alone. Normal equations would be
-    faster, but their gradients in float32 are 10 to 1000 times less exact at condition numbers 40 to 400.
+    With `ridge`, x minimises |m x - c|^2 + ridge s |x|^2, s = the mean eigenvalue of m m^T. Where the condition number
+    exceeds eps^(-1/2), the message `unresolved` of that band is an error.
+
+    notation: q r = (m^T, sqrt(ridge s) 1), q_1 = the rows of q beside m^T, x = q_1 r^-T c. Padding columns of m^T have
+    a one in a row of their own, which keeps full rank, as derivatives of QR need, and leaves the columns in use alone.
+    Normal equations would be faster, but their gradients in float32 are 10 to 1000 times less exact at condition
+    numbers 40 to 400.
     """
-    own_rows = np.where(mask[:, None, :], 0, np.eye(mask.shape[1]))
-    padded = jnp.concatenate([jnp.swapaxes(m, -1, -2), jnp.asarray(own_rows, dtype=m.dtype)], axis=1)
+    eye, used = np.eye(mask.shape[1]), np.broadcast_to(mask[:, None, :], (*mask.shape, mask.shape[1]))
+    own_rows = jnp.asarray(np.where(used, 0, eye), m.dtype)
+    if ridge:
+        mean = jnp.sum(m * m, axis=(1, 2)) / jnp.asarray(mask.sum(axis=1), m.dtype)
+        own_rows += jnp.sqrt(ridge * mean)[:, None, None] * jnp.asarray(np.where(used, eye, 0), m.dtype)
+    stacked = jnp.concatenate([jnp.swapaxes(m, -1, -2), own_rows], axis=1)
     # One band after another: jaxlib's batched LAPACK calls wait for threads of the pool from inside the pool, and two
     # at once on two cores wait for ever (seen with jaxlib 0.10.2).
-    q, r = jax.lax.map(lambda a: tuple(jnp.linalg.qr(a)), padded)
+    q, r = jax.lax.map(lambda a: tuple(jnp.linalg.qr(a)), stacked)
 
     # With n = 2l+1 rows, cond_F / n <= cond_2 <= cond_F: no singular values are needed.
     r_inverse = jax.lax.map(lambda a: solve_triangular(a, jnp.eye(r.shape[-1], dtype=r.dtype)), r)
     norm = lambda a: jnp.sqrt(jnp.sum(jnp.where(mask[:, None, :] & mask[:, :, None], a * a, 0), axis=(1, 2)))
     condition = norm(r) * norm(r_inverse) / jnp.asarray(mask.sum(axis=1), dtype=r.dtype)
     bad = ~(jax.lax.stop_gradient(condition) <= float(jnp.finfo(r.dtype).eps) ** -0.5)
-    c = eqx.branched_error_if(c, jnp.any(bad), jnp.argmax(bad), [_unresolved(l) for l in range(len(mask))])
+    c = eqx.branched_error_if(c, jnp.any(bad), jnp.argmax(bad), unresolved)
     solution = jax.lax.map(lambda a: solve_triangular(*a, trans="T"), (r, c))
     return jnp.matmul(q[:, : m.shape[-1]], solution, precision="highest")
 
@@ -183,13 +179,39 @@ def _unresolved(l: int) -> str:
     )
 
 
-def _same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
+def unit_axes(directions: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Unit axes, also after an optimiser has moved the field of a basis."""
+    z = normalize(directions)
+    message = "`directions` of the basis has a vector that is zero or not finite. Pass unit axes."
+    return eqx.error_if(z, ~jnp.all(jnp.isfinite(z)), message)
+
+
+def check_coefficients(coefficients: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
+    c, given = _checks.coefficients("coefficients", coefficients)
+    if given != degree:
+        raise ValueError(
+            f"`coefficients` must be of the basis' degree {degree}, {(degree + 1) ** 2} numbers on the last axis; got "
+            f"{list(c.shape)}, degree {given}. Truncate or pad with zeros."
+        )
+    return c
+
+
+def check_weights(weights: ArrayLike, degree: int, size: int) -> Float[Array, "*batch l k"]:
+    weights = _checks.real_array("weights", weights)
+    if weights.shape[-2:] != (degree + 1, size):
+        raise ValueError(
+            f"`weights` must have shape [..., degree + 1, K] = [..., {degree + 1}, {size}]; got {list(weights.shape)}."
+        )
+    return weights
+
+
+def same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
     dtype = jnp.promote_types(a.dtype, b.dtype)
     return a.astype(dtype), b.astype(dtype)
 
 
 @functools.cache
-def _padding(degree: int) -> tuple[np.ndarray, np.ndarray]:
+def padding(degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Where band l, padded to 2L+1 entries, finds its coefficients, and which entries are real: both [L+1, 2L+1]."""
     l, j = np.arange(degree + 1)[:, None], np.arange(2 * degree + 1)
     mask = j <= 2 * l
@@ -197,6 +219,6 @@ def _padding(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @functools.cache
-def _pi(degree: int) -> np.ndarray:
+def pi(degree: int) -> np.ndarray:
     """pi_l = sqrt(4 pi / (2l+1)) of ISD15 Eq. 9."""
     return np.sqrt(4 * np.pi / (2 * np.arange(degree + 1) + 1))

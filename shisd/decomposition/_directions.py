@@ -10,6 +10,8 @@ optimised for the conditioning that ISD15 section 5 asks for.
 
 import functools
 import importlib.resources
+from collections.abc import Sequence
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -23,7 +25,7 @@ from shisd._numerics import normalize
 from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import legendre
 
-TABLE_DEGREE = 32
+TABLE_DEGREE = 64
 
 
 def fibonacci_directions(count: int, *, dtype: DTypeLike = float) -> Float[Array, "{count} 3"]:
@@ -33,7 +35,7 @@ def fibonacci_directions(count: int, *, dtype: DTypeLike = float) -> Float[Array
     Worst-band condition number of 2L+1 of them for degree L: 2 to 240 up to degree 20, at worst 2400 up to degree 32.
     """
     i = np.arange(_checks.integer("count", count, 1))
-    return jnp.asarray(_upper((i + 0.5) / i.size, i * (np.sqrt(5) - 1) / 2), dtype=dtype)
+    return jnp.asarray(_on_sphere((i + 0.5) / i.size, i * (np.sqrt(5) - 1) / 2), dtype=dtype)
 
 
 def low_discrepancy_directions(count: int, *, dtype: DTypeLike = float) -> Float[Array, "{count} 3"]:
@@ -43,7 +45,20 @@ def low_discrepancy_directions(count: int, *, dtype: DTypeLike = float) -> Float
     Worst-band condition number of 2L+1 of them for degree L: 2 to 540 up to degree 20, at worst 7000 up to degree 32.
     """
     i = np.arange(1, _checks.integer("count", count, 1) + 1)
-    return jnp.asarray(_upper(_radical_inverse(i, 2), _radical_inverse(i, 3)), dtype=dtype)
+    return jnp.asarray(_on_sphere(_radical_inverse(i, 2), _radical_inverse(i, 3)), dtype=dtype)
+
+
+def separate_directions(degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 2*{degree}+1 3"]:
+    """Axes of their own for each level l = 0 ... L of an `IsotropicBasis`: no two levels look alike.
+
+    Arguments: static `degree`. Returns unit vectors [L+1, 2L+1, 3] over the whole sphere, in `dtype` (default: JAX's
+    float): one sequence of Halton points, cut into runs of 2L+1, so that the first 2l+1 of a level are spread as well.
+    Condition number of M at degree 20, Gaussians: 69; 2e4 if only 2l+1 axes serve level l; 1e10 if levels share them.
+    """
+    levels, count = _checks.degree(degree) + 1, 2 * degree + 1
+    i = np.arange(1, levels * count + 1)
+    z = _on_sphere(2 * _radical_inverse(i, 2) - 1, _radical_inverse(i, 3))
+    return jnp.asarray(z.reshape(levels, count, 3), dtype=dtype)
 
 
 def random_directions(count: int, key: Array, *, dtype: DTypeLike = float) -> Float[Array, "{count} 3"]:
@@ -58,12 +73,15 @@ def random_directions(count: int, key: Array, *, dtype: DTypeLike = float) -> Fl
 
 
 def optimized_directions(degree: int, *, dtype: DTypeLike = float) -> Float[Array, "2*{degree}+1 3"]:
-    """The best known 2L+1 shared axes for degree L = 0 ... 32, from the shipped table.
+    """The best known 2L+1 shared axes for degree L = 0 ... 64, from the shipped table.
 
     Arguments: static `degree`. Returns unit vectors [2L+1, 3] with z >= 0, in `dtype` (default: JAX's float). The first
     2l+1 of them also serve band l alone (`RotatedZonalBasis(..., nested=True)`), less well.
-    Accuracy: worst-band condition numbers 2.3, 2.9, 4.4, 6.4, 8.8 at degree 4, 8, 12, 20, 32; up to 190 with `nested`.
-    Source: `optimize_directions` from many starts; tests/bench/make_directions.py makes the table.
+    Accuracy: worst-band condition numbers 2.3, 2.9, 4.4, 6.4, 8.8, 15.0 at degree 4, 8, 12, 20, 32, 64; with `nested`
+    5.7, 5.9, 29, 150, 130, 376.
+    Limits: no 2L+1 axes do better than 1.60, 1.77, 1.86, 1.95, 2.02 at degree 4, 8, 12, 20, 32, by linear programming
+    (tests/bench/conditioning.py): how much of the gap can be closed is not known.
+    Source: `optimize_directions`; tests/bench/make_directions.py makes the table.
     """
     degree = _checks.degree(degree)
     if degree > TABLE_DEGREE:
@@ -75,63 +93,133 @@ def optimized_directions(degree: int, *, dtype: DTypeLike = float) -> Float[Arra
     return jnp.asarray(_table()[degree**2 : (degree + 1) ** 2], dtype=dtype)
 
 
-def conditioning_loss(directions: ArrayLike, degree: int, *, power: ArrayLike = 8.0) -> Scalar:
+def conditioning_loss(
+    directions: ArrayLike,
+    degree: int,
+    *,
+    power: ArrayLike = 8.0,
+    nested: bool = False,
+    bands: Sequence[int] | None = None,
+) -> Scalar:
     """A smooth bound on the worst band's log condition number: what `optimize_directions` makes small.
 
     With mu the 2l+1 eigenvalues of M_l M_l^T (ISD15 Eq. 10), which are the nonzero ones of the Gram matrix
-    P_l(z_i . z_j), in units of their mean K/(2l+1):
+    P_l(z_i . z_j), in units of their mean:
 
         loss = 1/(2p) log sum_l (sum_i mu_i^p) (sum_i mu_i^-p)
 
-    It exceeds max_l log cond(M_l) by at most log((2L+1) sqrt(L+1)) / p, and tends to it as `power` p grows.
+    It exceeds max_l log cond(M_l) by at most log((2L+1) sqrt(L+1)) / p, and tends to it as `power` p grows. At p = 1 it
+    is the mean eigenvalue times the mean inverse, the frame potential of least squares.
 
     Arguments: `directions` [K, 3], nonzero, taken as unit vectors along them; static `degree` L, with K >= 2L+1;
-    `power` > 0.
+    `power` > 0; static `nested`: band l has only the first 2l+1 axes; static `bands`: those that count, by default
+    0 ... L (for axes that serve band l alone, bands=(l,)).
     Derivatives: in directions, first order, both modes, also where eigenvalues meet, because the sums are symmetric in
     them. Infinite or NaN for singular sets.
     """
     z, degree = _axes(directions, degree)
-    size = z.shape[0]
-    # Legendre polynomials at cosines that rounding left above 1 are harmless: the recurrence is a polynomial.
-    gram = jnp.moveaxis(legendre(jnp.einsum("ic,jc->ij", z, z), degree), -1, 0)  # [L+1, K, K]
-    mean = jnp.asarray(size / (2 * np.arange(degree + 1) + 1), dtype=z.dtype)
-    mu = jnp.linalg.eigvalsh(gram) / mean[:, None]  # ascending, so the last 2l+1 belong to band l
-    kept = np.arange(size) >= size - (2 * np.arange(degree + 1)[:, None] + 1)
-    log_mu = jnp.where(kept, jnp.log(jnp.where(kept, mu, 1)), -jnp.inf)
-    inverse = jnp.where(kept, -log_mu, -jnp.inf)
-    p = jnp.asarray(power, dtype=z.dtype)
-    bands = jax.nn.logsumexp(p * log_mu, axis=1) + jax.nn.logsumexp(p * inverse, axis=1)
-    return jax.nn.logsumexp(bands) / (2 * p)
+    return _loss(z, jnp.asarray(power, dtype=z.dtype), degree, bool(nested), _bands(bands, degree))
 
 
 def optimize_directions(
-    directions: ArrayLike, degree: int, *, powers: tuple[float, ...] = (1.0, 3.0, 8.0), max_steps: int = 256
+    directions: ArrayLike,
+    degree: int,
+    *,
+    nested: bool = False,
+    bands: Sequence[int] | None = None,
+    mirror: Literal["x", "y", "z"] | None = None,
+    powers: Sequence[float] = (1.0, 3.0, 8.0),
+    max_steps: int = 256,
 ) -> Float[Array, "K 3"]:
     """`directions` moved to lower the worst condition number of bands 0 ... `degree`.
 
     BFGS on `conditioning_loss`, its power raised through `powers`: low powers spread all axes, high ones work on the
     worst band. Finds a local minimum that depends on the start; deterministic.
 
-    Arguments: `directions` [K, 3], the start, nonzero; static `degree` L, with K >= 2L+1; at most `max_steps` steps per
-    power. Returns unit vectors in the same order, hemispheres not restored. Work in float64 for the last digits.
+    Arguments: `directions` [K, 3], the start, nonzero, or several starts [S, K, 3], of which the best result is
+    returned; static `degree` L, with K >= 2L+1; static `nested` and `bands` as in `conditioning_loss`; at most
+    `max_steps` steps per power. Static `mirror`: keep the set closed under reflection at the plane "x" = 0, "y" = 0 or
+    "z" = 0: its first axis lies in the plane, and 2i is the image of 2i - 1 (K must be odd); the start gives the axes
+    1, 3, 5, ... A set closed under reflection at "y" has weights that come in pairs for isotropic materials seen along
+    x. Axes are antipodal in themselves: z and -z are one.
+    Returns unit vectors [K, 3] in the same order, hemispheres not restored. Work in float64 for the last digits.
     A singular start, whose loss is not finite, comes back as it is: the basis refuses it with a clear message.
     Derivatives: none are meant; differentiate `conditioning_loss`.
+    Cost: at each step the eigenvalues of a K x K matrix for every band; `make bench` reports the time.
     """
-    z, degree = _axes(directions, degree)
-    return _minimise(z, jnp.asarray(powers, dtype=z.dtype), degree, _checks.integer("max_steps", max_steps, 1))
+    starts = _checks.vectors("directions", directions)
+    several = starts.ndim == 3 and len(starts) > 0
+    degree = _axes(starts[0] if several else starts, degree)[1]
+    if mirror not in (None, "x", "y", "z"):
+        raise ValueError(f"`mirror` must be None, 'x', 'y' or 'z'; got {mirror!r}.")
+    if mirror is not None and starts.shape[-2] % 2 == 0:
+        raise ValueError(f"`mirror` needs an odd number of axes: one in the plane, and pairs; got {starts.shape[-2]}.")
+    steps, plane = _checks.integer("max_steps", max_steps, 1), None if mirror is None else "xyz".index(mirror)
+    starts = normalize(starts if several else starts[None])
+    return _minimise(
+        starts, jnp.asarray(powers, dtype=starts.dtype), degree, steps, bool(nested), _bands(bands, degree), plane
+    )
 
 
 @eqx.filter_jit
-def _minimise(z: Float[Array, "K 3"], powers: Float[Array, " p"], degree: int, max_steps: int) -> Float[Array, "K 3"]:
-    loss = lambda x, power: conditioning_loss(x, degree, power=power)
-    tolerance = float(jnp.finfo(z.dtype).eps) ** 0.5
+def _minimise(
+    starts: Float[Array, "S K 3"],
+    powers: Float[Array, " p"],
+    degree: int,
+    max_steps: int,
+    nested: bool,
+    bands: tuple[int, ...],
+    plane: int | None,
+) -> Float[Array, "K 3"]:
+    free = starts if plane is None else jnp.concatenate([starts[:, :1], starts[:, 1::2]], axis=1)
+    whole = (lambda z: z) if plane is None else lambda z: _mirrored(z, plane)
+    loss = lambda z, power: _loss(normalize(whole(z)), power, degree, nested, bands)
+    tolerance = float(jnp.finfo(starts.dtype).eps) ** 0.5
     solver = optx.BFGS(rtol=tolerance, atol=tolerance)
 
     def stage(z, power):
         found = normalize(optx.minimise(loss, solver, z, power, max_steps=max_steps, throw=False).value)
         return jnp.where(loss(found, power) < loss(z, power), found, z), None  # False for NaN
 
-    return jax.lax.scan(stage, z, powers)[0]
+    def run(z):
+        z = jax.lax.scan(stage, z, powers)[0]
+        return z, loss(z, powers[-1])
+
+    found, losses = jax.lax.map(run, free)
+    return normalize(whole(found[jnp.nanargmin(losses)]))
+
+
+def _mirrored(free: Float[Array, "h 3"], plane: int) -> Float[Array, "k 3"]:
+    """One axis in the plane, then pairs."""
+    flip = jnp.asarray(np.where(np.arange(3) == plane, -1, 1), free.dtype)[None]
+    first = free[:1] * jnp.asarray(np.arange(3) != plane, free.dtype)[None]
+    pairs = jnp.stack([free[1:], free[1:] * flip], axis=1).reshape(-1, 3)
+    return jnp.concatenate([first, pairs])
+
+
+def _loss(z: Float[Array, "K 3"], power: Scalar, degree: int, nested: bool, bands: tuple[int, ...]) -> Scalar:
+    size, counts = z.shape[0], 2 * np.asarray(bands)[:, None] + 1
+    # Legendre polynomials at cosines that rounding left above 1 are harmless: the recurrence is a polynomial.
+    gram = jnp.moveaxis(legendre(jnp.einsum("ic,jc->ij", z, z), degree), -1, 0)[np.asarray(bands, np.int32)]
+    axes = np.broadcast_to(counts if nested else size, counts.shape)  # that a band uses
+    if nested:
+        used = np.arange(size) < axes
+        gram = jnp.where(used[:, :, None] & used[:, None, :], gram, 0)
+    mu = jnp.linalg.eigvalsh(gram) / jnp.asarray(axes / counts, dtype=z.dtype)
+    kept = np.arange(size) >= size - counts  # they ascend, so the last 2l+1 belong to band l
+    log_mu = jnp.where(kept, jnp.log(jnp.where(kept, mu, 1)), -jnp.inf)
+    inverse = jnp.where(kept, -log_mu, -jnp.inf)
+    products = jax.nn.logsumexp(power * log_mu, axis=1) + jax.nn.logsumexp(power * inverse, axis=1)
+    return jax.nn.logsumexp(products) / (2 * power)
+
+
+def _bands(bands: Sequence[int] | None, degree: int) -> tuple[int, ...]:
+    if bands is None:
+        return tuple(range(degree + 1))
+    chosen = tuple(_checks.integer("bands", l) for l in bands)
+    if not chosen or max(chosen) > degree:
+        raise ValueError(f"`bands` must hold at least one degree, none above {degree}; got {list(chosen)}.")
+    return chosen
 
 
 def _axes(directions: ArrayLike, degree: int) -> tuple[Float[Array, "K 3"], int]:
@@ -151,10 +239,10 @@ def check_count(directions: Array, degree: int) -> None:
         )
 
 
-def _upper(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The unit square on the upper hemisphere, areas kept: z = u, azimuth = 2 pi v."""
-    sine, azimuth = np.sqrt(1 - u * u), 2 * np.pi * v
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), u], axis=-1)
+def _on_sphere(z: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Heights and turns on the sphere, areas kept: azimuth = 2 pi v."""
+    sine, azimuth = np.sqrt(1 - z * z), 2 * np.pi * v
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), z], axis=-1)
 
 
 def _radical_inverse(i: np.ndarray, base: int) -> np.ndarray:

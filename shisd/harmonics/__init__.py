@@ -14,6 +14,7 @@ from shisd.harmonics._sh import evaluate as evaluate
 from shisd.harmonics._sh import sh_basis as sh_basis
 from shisd.harmonics._transform import project as project
 from shisd.harmonics._transform import project_map as project_map
+from shisd.harmonics._transform import sample_map as sample_map
 from shisd.harmonics._transform import synthesize_map as synthesize_map
 from shisd.harmonics._windows import Deringed as Deringed
 from shisd.harmonics._windows import WindowStatus as WindowStatus

@@ -117,34 +117,7 @@ class Environment(eqx.Module):
         accepted. Output dtype is that of the directions. Derivatives: in texels and directions; those in directions
         jump between texels. At a pole itself phi is taken as 0 and derivatives in directions are zero.
         """
-        w = _checks.vectors("directions", directions)
-        height, width = self.texels.shape[:2]
-        x, y, z = w[..., 0], w[..., 1], w[..., 2]
-        sine2 = x * x + y * y
-        off_pole = sine2 > 0
-        sine = jnp.where(off_pole, jnp.sqrt(jnp.where(off_pole, sine2, 1)), 0)
-        theta = jnp.where(off_pole, jnp.arctan2(sine, z), jnp.where(z < 0, np.pi, 0).astype(z.dtype))
-        phi = jnp.arctan2(jnp.where(off_pole, y, 0), jnp.where(off_pole, x, 1))
-        row, v = _split(theta * (height / np.pi) - 0.5)
-        column, u = _split(phi * (width / (2 * np.pi)) - 0.5)
-
-        def texel(row, column):
-            beyond = (row < 0) | (row >= height)  # across a pole
-            column = jnp.where(beyond, column + width // 2, column) % width
-            value = self.texels[jnp.clip(row, 0, height - 1), column].astype(w.dtype)
-            return value if value.ndim > row.ndim else value[..., None]
-
-        u, v = u[..., None], v[..., None]
-        upper = (1 - u) * texel(row, column) + u * texel(row, column + 1)
-        lower = (1 - u) * texel(row + 1, column) + u * texel(row + 1, column + 1)
-        value = (1 - v) * upper + v * lower
-        return value if self.texels.ndim == 3 else value[..., 0]
-
-
-def _split(position: Float[Array, "*batch"]) -> tuple[Array, Array]:
-    """Whole part and fraction."""
-    whole = jnp.floor(position)
-    return whole.astype(int), position - whole
+        return harmonics.sample_map(self.texels, directions)
 
 
 def _directions(height: int) -> np.ndarray:

@@ -109,7 +109,7 @@ def tabulate_brdf(
     basis: RotatedZonalBasis,
     *,
     views: int = 64,
-    azimuths: int = 32,
+    azimuths: int | None = None,
     quadrature: int | None = None,
     domain: Literal["sphere", "upper"] = "sphere",
     ridge: float = 1e-6,
@@ -119,10 +119,12 @@ def tabulate_brdf(
     """RZH weights of a material: its cosine-weighted view slices, projected and decomposed (ISD15 Eq. 21).
 
     Arguments: `brdf`; the `basis` to decompose into. Static: `views`, elevations of the table, at least 4; `azimuths`,
-    even, for anisotropic materials only; `quadrature`, nodes from the mirror direction to the horizon (and half as many
-    in each eighth of a turn about it), by default 32 + degree. Every slice is integrated again with three quarters of
-    the nodes: where that changes a coefficient by more than `tolerance` of the largest one, the table is an error at
-    run time that says so; `throw=False` leaves it to the caller, in `Lobes.quadrature_error`.
+    even, for anisotropic materials only, by default 2 degree + 4 and at least 32: a slice turns with the view, so its
+    order m goes round m times, and fewer azimuths alias without notice; `quadrature`, nodes from the mirror direction
+    to the horizon (and half as many in each eighth of a turn about it), by default 32 + degree. Every slice is
+    integrated again with three quarters of the nodes: where that changes a coefficient by more than `tolerance` of the
+    largest one, the table is an error at run time that says so; `throw=False` leaves it to the caller, in
+    `Lobes.quadrature_error`.
     `domain` "upper" fits the slices above the horizon only, for integrals over lights that are cut off there
     (`shade_polygon`): the kink of the cosine is no longer expanded, and errors are up to 100 times smaller. `ridge`
     limits what the fit may do below the horizon: rounding grows like 1/sqrt(ridge), measured 1e-5 in float32 at the
@@ -137,7 +139,7 @@ def tabulate_brdf(
     if not isinstance(basis, RotatedZonalBasis):
         raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis; got {type(basis).__name__}.")
     views = _checks.integer("views", views, 4)
-    azimuths = _checks.integer("azimuths", azimuths, 4)
+    azimuths = max(32, 2 * basis.degree + 4) if azimuths is None else _checks.integer("azimuths", azimuths, 4)
     if azimuths % 2:
         raise ValueError(f"`azimuths` must be even; got {azimuths}.")
     if domain not in ("sphere", "upper"):

@@ -1,14 +1,15 @@
-"""Make shisd/decomposition/data/optimized_directions.npz: 2L+1 shared axes for each degree L = 0 ... 32.
+"""Make shisd/decomposition/data/optimized_directions.npz: 2L+1 shared axes for each degree L = 0 ... 64.
 
     python tests/bench/make_directions.py [--overwrite] [--output FILE] [--degrees 0 1 2] [--effort 1.0]
 
 For each degree: every start (Fibonacci, Halton, then seeded random axes) is optimised with the default powers, the two
-best go on with higher powers, and the best of those is kept. With --overwrite, a degree of the old table is replaced
-only if its condition number falls. The shipped table took --effort 1 up to degree 17, 0.25 up to degree 24 and 0
-above: three quarters of an hour on one busy core.
+best go on with higher powers, and the best of those is kept. Above degree 32 the Fibonacci start alone is, without
+more. With --overwrite, a degree of the old table is replaced only if its condition number falls. The shipped table took
+--effort 1 up to degree 17, 0.25 up to degree 24 and 0 above: an hour and a half on one busy core.
 
-The file holds `directions` [33^2, 3], rows L^2 ... (L+1)^2 - 1 for degree L, and `conditions` [33], the worst band's
-condition number, computed with SciPy and NumPy alone. Within a degree the rows are ordered such that the first 2l+1 are
+The file holds `directions` [65^2, 3], rows L^2 ... (L+1)^2 - 1 for degree L, and the worst band's condition number,
+computed with SciPy and NumPy alone: `conditions` [65] where all axes serve every band, `nested_conditions` [65] where
+only the first 2l+1 do. Within a degree the rows are ordered such that the first 2l+1 are
 a good choice for band l alone: from the last to the first, the axis is dropped that takes least of the determinant.
 """
 
@@ -23,7 +24,8 @@ from scipy.special import sph_harm_y
 from shisd import decomposition
 
 OUTPUT = Path(decomposition.__file__).parent / "data" / "optimized_directions.npz"
-TOP = 32
+TOP = 64
+MANY_STARTS = 32
 POLISH = (20.0, 60.0)
 
 
@@ -35,13 +37,13 @@ def band_matrix(z: np.ndarray, l: int) -> np.ndarray:
     return np.sqrt(4 * np.pi / (2 * l + 1)) * rows
 
 
-def worst_condition(z: np.ndarray, degree: int) -> float:
-    return max(np.linalg.cond(band_matrix(z, l)) for l in range(degree + 1))
+def worst_condition(z: np.ndarray, degree: int, *, nested: bool = False) -> float:
+    return max(np.linalg.cond(band_matrix(z[: 2 * l + 1] if nested else z, l)) for l in range(degree + 1))
 
 
 def starts(degree: int, effort: float):
     count = 2 * degree + 1
-    numbers = {4: 150, 8: 60, 12: 30, 16: 16, 20: 8, 24: 6, 28: 5, 32: 4}
+    numbers = {4: 150, 8: 60, 12: 30, 16: 16, 20: 8, 24: 6, 28: 5, TOP: 4}
     number = next(n for top, n in numbers.items() if degree <= top)
     yield decomposition.fibonacci_directions(count)
     yield decomposition.low_discrepancy_directions(count)
@@ -50,6 +52,8 @@ def starts(degree: int, effort: float):
 
 
 def best_axes(degree: int, effort: float) -> np.ndarray:
+    if degree > MANY_STARTS:
+        return np.asarray(decomposition.optimize_directions(next(starts(degree, effort)), degree))
     found = [np.asarray(decomposition.optimize_directions(z, degree)) for z in starts(degree, effort)]
     found = sorted(found, key=lambda z: worst_condition(z, degree))[:2]
     found += [np.asarray(decomposition.optimize_directions(z, degree, powers=POLISH, max_steps=512)) for z in found]
@@ -82,10 +86,10 @@ def main() -> None:
     if options.output.exists() and not options.overwrite:
         raise SystemExit(f"{options.output} exists; pass --overwrite to improve it.")
 
-    table, conditions = np.zeros(((TOP + 1) ** 2, 3)), np.full(TOP + 1, np.inf)
+    table, conditions, nested = np.zeros(((TOP + 1) ** 2, 3)), np.full(TOP + 1, np.inf), np.full(TOP + 1, np.inf)
     if options.output.exists():
         with np.load(options.output) as old:
-            table, conditions = old["directions"], old["conditions"]
+            table, conditions, nested = old["directions"], old["conditions"], old["nested_conditions"]
     options.output.parent.mkdir(exist_ok=True)
     for degree in options.degrees:
         began, rows = time.perf_counter(), slice(degree**2, (degree + 1) ** 2)
@@ -94,8 +98,8 @@ def main() -> None:
         seconds = time.perf_counter() - began
         print(f"{degree:3d}  {condition:8.4f}  (before: {conditions[degree]:.4f})  {seconds:6.1f} s", flush=True)
         if condition < conditions[degree]:
-            table[rows], conditions[degree] = z, condition
-        np.savez_compressed(options.output, directions=table, conditions=conditions)
+            table[rows], conditions[degree], nested[degree] = z, condition, worst_condition(z, degree, nested=True)
+        np.savez_compressed(options.output, directions=table, conditions=conditions, nested_conditions=nested)
         jax.clear_caches()
 
 

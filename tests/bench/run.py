@@ -7,6 +7,7 @@ flags: default.
 """
 
 import argparse
+import inspect
 import json
 import os
 import subprocess
@@ -22,7 +23,7 @@ from shisd.domains import _moments
 from shisd.domains._integrate import loop_coefficients
 from shisd.domains._polygon import loop_solid_angle
 from shisd.harmonics import _tables
-from tests.bench import equation_22, lobes, native, polygons
+from tests.bench import conditioning, equation_22, lobes, native, polygons
 from tests.bench.timing import interleaved
 from tests.truth import scipy_basis, triangle_rule, zonal_moments
 
@@ -431,8 +432,22 @@ BENCHES = {
     "coefficients": bench_coefficients,
     "polygon_light": bench_polygon_light,
     "ridge": bench_ridge,
+    "directions": conditioning.bench_directions,
+    "objectives": conditioning.bench_objectives,
+    "kernels": conditioning.bench_kernels,
+    "kernel_pictures": conditioning.bench_kernel_pictures,
     "lobes": lobes.compare,
 }
+FIGURES = {
+    "polygon_degree": ("polygon_cost.png", cost_figure),
+    "kernels": ("conditioning.png", conditioning.kernels_figure),
+    "lobes": ("lobes.png", lobes.figure),
+}
+README = {  # markers, and the benchmarks whose tables stand between them
+    "conditioning": ("directions", "objectives", "kernels", "kernel_pictures"),
+    "lobes": ("lobes",),
+}
+README["bench"] = tuple(name for name in BENCHES if not any(name in names for names in README.values()))
 
 
 def table(rows):
@@ -474,25 +489,22 @@ def main():
     results, sections = {}, {}
     for name in arguments.only or BENCHES:
         results[name] = BENCHES[name]()
-        sections[name] = f"{BENCHES[name].__doc__}\n\n{table(results[name])}"
+        shown = lobes.summary(results[name]) if name == "lobes" else results[name]
+        sections[name] = f"{inspect.cleandoc(BENCHES[name].__doc__)}\n\n{table(shown)}"
         print(sections[name], "\n", flush=True)
-        if name == "polygon_degree":
-            cost_figure(results[name], arguments.output / "polygon_cost.png")
+        if name in FIGURES:
+            file, draw = FIGURES[name]
+            draw(results[name], arguments.output / file)
             if arguments.readme:
-                cost_figure(results[name], Path("examples/polygon_cost.png"))
-        if name == "lobes":
-            lobes.figure(results[name], arguments.output / "lobes.png")
-            if arguments.readme:  # a figure and a table of their own
-                lobes.figure(results[name], Path("examples/lobes.png"))
-                paste("lobes", f"{lobes.CAPTION}\n\n{table(lobes.summary(results[name]))}")
+                draw(results[name], Path("examples") / file)
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
     (arguments.output / "bench.json").write_text(json.dumps(results, indent=1))
     (arguments.output / "bench.md").write_text("\n\n".join([*sections.values(), note]) + "\n")
-    sections.pop("lobes", None)
-    if arguments.readme and sections:
-        paste("bench", "\n\n".join([*sections.values(), note]))
+    for marker, names in README.items() if arguments.readme else ():
+        if all(name in sections for name in names):
+            paste(marker, "\n\n".join([*(sections[name] for name in names), note]))
 
 
 if __name__ == "__main__":

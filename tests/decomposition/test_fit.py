@@ -105,7 +105,7 @@ def test_wrong_lobes(as_user):
 # --- fits -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_fit_finds_the_truth(count, dtype):
     truth = mixture(dtype, count)
     data = samples(truth, dtype)
