@@ -225,15 +225,16 @@ def test_optimizer_improves_a_random_start_and_is_deterministic(dtype):
 
 
 def test_the_best_of_several_starts_is_kept(x64):
-    starts = jnp.stack([decomposition.random_directions(7, jax.random.key(i)) for i in range(3)])
-    bad = jnp.asarray(np.repeat(np.eye(3), [3, 2, 2], axis=0))  # coincident axes: singular
-    together = decomposition.optimize_directions(jnp.concatenate([bad[None], starts]), 3, max_steps=60)
-    alone = [decomposition.optimize_directions(z, 3, max_steps=60) for z in starts]
-    best = min(float(decomposition.conditioning_loss(z, 3)) for z in alone)
-    np.testing.assert_allclose(decomposition.conditioning_loss(together, 3), best, rtol=1e-6)
+    starts = [decomposition.random_directions(9, jax.random.key(i)) for i in (3, 5)]
+    singular = jnp.asarray(np.repeat(np.eye(3), 3, axis=0))
+    together = decomposition.optimize_directions(jnp.stack([singular, *starts]), 4)
+    best = min(float(decomposition.conditioning_loss(decomposition.optimize_directions(z, 4), 4)) for z in starts)
+    np.testing.assert_allclose(decomposition.conditioning_loss(together, 4), best, rtol=1e-6)
 
 
-@pytest.mark.parametrize("plane", ["x", "y", "z"])
+@pytest.mark.parametrize(
+    "plane", [pytest.param("x", marks=pytest.mark.slow), "y", pytest.param("z", marks=pytest.mark.slow)]
+)
 def test_mirrored_sets_stay_mirrored(plane, x64):
     found = np.asarray(decomposition.optimize_directions(decomposition.fibonacci_directions(9), 4, mirror=plane))
     axis = "xyz".index(plane)

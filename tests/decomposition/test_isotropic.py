@@ -53,7 +53,7 @@ def check_round_trip(kernel, z, degree, nested, dtype, rng):
     return float(found.condition_number)
 
 
-@pytest.mark.parametrize("nested", [False, True], ids=["all", "2l+1"])
+@pytest.mark.parametrize("nested", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["all", "2l+1"])
 @pytest.mark.parametrize("name", KERNELS)
 def test_band_limited_functions_are_reproduced_within_ten_eps_times_the_condition(name, nested, dtype, rng):
     check_round_trip(KERNELS[name](), decomposition.separate_directions(DEGREE), DEGREE, nested, dtype, rng)
@@ -166,7 +166,7 @@ def test_filtering_is_the_integral_of_signal_times_turned_kernel(name, dtype, rn
     np.testing.assert_allclose(got, expected, atol=limit * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("shared", [True, False], ids=["shared", "separate"])
+@pytest.mark.parametrize("shared", [pytest.param(True, marks=pytest.mark.slow), False], ids=["shared", "separate"])
 def test_lookups_in_filtered_maps_converge_to_filtering(shared, x64, rng):
     z = decomposition.optimized_directions(3) if shared else decomposition.separate_directions(3)
     basis = IsotropicBasis(decomposition.GaussianKernel(), z, 3)
