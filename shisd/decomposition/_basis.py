@@ -66,7 +66,7 @@ class RotatedZonalBasis(eqx.Module):
         Cost: L+1 QR decompositions of K x (2L+1); batches of coefficients share them.
         """
         c, m = same_dtype(check_coefficients(coefficients, self.degree), self._matrices())
-        return weights_by_band(m, c, self.degree)
+        return used_only(weights_by_band(m, c, self.degree), self.nested)
 
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
         """SH coefficients of a weighted sum, the inverse of `weights`: c_l = M_l lambda_l (ISD15 Eq. 10).
@@ -74,7 +74,7 @@ class RotatedZonalBasis(eqx.Module):
         Arguments: `weights` [..., L+1, K]. Returns [..., (L+1)^2]. A nested basis ignores the weights of axes that a
         band does not use, in `evaluate` too.
         """
-        weights, m = same_dtype(check_weights(weights, self.degree, self.size), self._matrices())
+        weights, m = same_dtype(check_weights(weights, self.degree, self.size, self.nested), self._matrices())
         c = jnp.einsum("lmk,...lk->...lm", m, weights, precision="highest")
         _, mask = padding(self.degree)
         return c[..., mask]
@@ -87,7 +87,8 @@ class RotatedZonalBasis(eqx.Module):
         Cost: directions x K x L, without a stored basis.
         Source: Clenshaw's summation of the recurrence DLMF 14.10.3.
         """
-        weights, axes = same_dtype(check_weights(weights, self.degree, self.size), unit_axes(self.directions))
+        weights = check_weights(weights, self.degree, self.size, self.nested)
+        weights, axes = same_dtype(weights, unit_axes(self.directions))
         w, axes = same_dtype(normalize(_checks.vectors("directions", directions)), axes)
         x = jnp.einsum("...i,ki->...k", w, axes, precision="highest")
         shape = jnp.broadcast_shapes(x.shape, (*weights.shape[:-2], self.size))
@@ -96,8 +97,6 @@ class RotatedZonalBasis(eqx.Module):
         b, after = jnp.zeros_like(x), jnp.zeros_like(x)
         for l in range(self.degree, -1, -1):
             a = jnp.broadcast_to(weights[..., l, :], shape) / pi(self.degree)[l].item()
-            if self.nested:
-                a = jnp.where(jnp.broadcast_to(np.arange(self.size) <= 2 * l, shape), a, 0)
             b, after = a + (2 * l + 1) / (l + 1) * x * b - (l + 1) / (l + 2) * after, b
         return jnp.sum(b, axis=-1)
 
@@ -116,10 +115,7 @@ class RotatedZonalBasis(eqx.Module):
         index, mask = padding(self.degree)
         y = sh_basis(unit_axes(self.directions), self.degree)
         m = jnp.moveaxis(y, 0, -1)[index] * jnp.asarray(pi(self.degree), dtype=y.dtype)[:, None, None]
-        used = mask[:, :, None]
-        if self.nested:
-            used = used & (np.arange(self.size) <= 2 * np.arange(self.degree + 1)[:, None])[:, None, :]
-        return jnp.where(used, m, 0)
+        return used_only(jnp.where(mask[:, :, None], m, 0).swapaxes(0, 1), self.nested).swapaxes(0, 1)
 
 
 def weights_by_band(
@@ -196,13 +192,24 @@ def check_coefficients(coefficients: ArrayLike, degree: int) -> Float[Array, "*b
     return c
 
 
-def check_weights(weights: ArrayLike, degree: int, size: int) -> Float[Array, "*batch l k"]:
+def check_weights(weights: ArrayLike, degree: int, size: int, nested: bool) -> Float[Array, "*batch l k"]:
     weights = _checks.real_array("weights", weights)
     if weights.shape[-2:] != (degree + 1, size):
         raise ValueError(
             f"`weights` must have shape [..., degree + 1, K] = [..., {degree + 1}, {size}]; got {list(weights.shape)}."
         )
-    return weights
+    return used_only(weights, nested)
+
+
+def used_only(values: Float[Array, "*batch l k"], nested: bool) -> Float[Array, "*batch l k"]:
+    """Zero where band l of a nested basis does not use axis k, which is where k > 2l.
+
+    Solves leave rounding there, and where M is ill conditioned there is a lot of it.
+    """
+    if not nested:
+        return values
+    used = np.arange(values.shape[-1]) <= 2 * np.arange(values.shape[-2])[:, None]
+    return jnp.where(jnp.broadcast_to(used, values.shape), values, 0)
 
 
 def same_dtype(a: Array, b: Array) -> tuple[Array, Array]:

@@ -107,11 +107,7 @@ class IsotropicBasis(eqx.Module):
         y = jnp.broadcast_to(jnp.moveaxis(y, -1, 0).reshape(y.shape[-1], -1, self.size), self._shape)
         band = _tables.bands(self.degree)
         factor = (self.zonal() * jnp.asarray(_basis.pi(self.degree), y.dtype)[None])[:, band]
-        m = y * factor.T[:, :, None]
-        if not self.nested:
-            return m
-        used = np.arange(self.size) <= 2 * np.arange(self.degree + 1)[:, None]
-        return jnp.where(used[None], m, 0)
+        return _basis.used_only(y * factor.T[:, :, None], self.nested)
 
     @eqx.filter_jit
     def weights(self, coefficients: ArrayLike, *, ridge: float = 0.0) -> Float[Array, "*batch l k"]:
@@ -138,7 +134,8 @@ class IsotropicBasis(eqx.Module):
     @eqx.filter_jit
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
         """SH coefficients [..., (L+1)^2] of a weighted sum, c = M lambda, from `weights` [..., L+1, K]."""
-        weights, m = _basis.same_dtype(_basis.check_weights(weights, self.degree, self.size), self.matrix())
+        weights = _basis.check_weights(weights, self.degree, self.size, self.nested)
+        weights, m = _basis.same_dtype(weights, self.matrix())
         return _apply(m, weights)
 
     def evaluate(self, weights: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
@@ -211,11 +208,11 @@ class IsotropicBasis(eqx.Module):
 
     def _solve(self, m: Float[Array, "n l k"], c: Float[Array, "*batch n"], ridge: float) -> Float[Array, "*batch l k"]:
         if self.kernel.diagonal:
-            return _basis.weights_by_band(self._blocks(m), c, self.degree, ridge)
+            return _basis.used_only(_basis.weights_by_band(self._blocks(m), c, self.degree, ridge), self.nested)
         n = m.shape[0]
         columns = c.reshape(-1, n).T
         weights = _basis.minimum_norm(m.reshape(1, n, -1), columns[None], np.ones((1, n), bool), [_SINGULAR], ridge)
-        return weights[0].T.reshape(*c.shape[:-1], *m.shape[1:])
+        return _basis.used_only(weights[0].T.reshape(*c.shape[:-1], *m.shape[1:]), self.nested)
 
     def _condition(self, m: Float[Array, "n l k"]) -> Scalar:
         if not self.kernel.diagonal:
@@ -234,7 +231,7 @@ class IsotropicBasis(eqx.Module):
 
     def _turned(self, one, weights: ArrayLike, rotations: ArrayLike, dtype) -> Array:
         """one(weights, R z) for all rotations."""
-        weights = _basis.check_weights(weights, self.degree, self.size)
+        weights = _basis.check_weights(weights, self.degree, self.size, self.nested)
         r = _checks.real_array("rotations", rotations)
         if r.shape[-2:] != (3, 3):
             raise ValueError(f"`rotations` must have shape [..., 3, 3]; got {list(r.shape)}.")

@@ -166,6 +166,23 @@ def test_filtering_is_the_integral_of_signal_times_turned_kernel(name, dtype, rn
     np.testing.assert_allclose(got, expected, atol=limit * np.abs(expected).max())
 
 
+def test_axes_that_a_level_does_not_use_stay_out_where_the_condition_is_bad(x64, rng):
+    degree = 7  # condition 1e7: the rounding that a solve leaves on unused axes is large
+    basis = IsotropicBasis(
+        decomposition.GaussianKernel(), decomposition.optimized_directions(degree), degree, nested=True
+    )
+    c, signal = rng.standard_normal(64), rng.standard_normal(64)
+    weights = basis.weights(c)
+    assert np.all(np.asarray(weights)[np.arange(15) > 2 * np.arange(8)[:, None]] == 0)
+    limit = 1e-15 * float(basis.condition_number()) * np.linalg.norm(c) * np.linalg.norm(signal)
+    np.testing.assert_allclose(basis.filter(weights, signal, np.eye(3)), c @ signal, atol=limit)
+    np.testing.assert_allclose(
+        basis.filter(weights + 1, signal, np.eye(3)),
+        basis.filter(jnp.where(weights, weights + 1, 0), signal, np.eye(3)),
+        atol=1e-6,
+    )
+
+
 @pytest.mark.parametrize("shared", [pytest.param(True, marks=pytest.mark.slow), False], ids=["shared", "separate"])
 def test_lookups_in_filtered_maps_converge_to_filtering(shared, x64, rng):
     z = decomposition.optimized_directions(3) if shared else decomposition.separate_directions(3)
