@@ -1,8 +1,8 @@
 """Few lobes fitted to samples by non-linear least squares, their weights by linear least squares inside.
 
 ISD15 section 7.2 calls fits of Gaussian mixtures expensive and unstable, and compares with them; tests/bench does too.
-Measured on slices of four materials, 1 to 7 Gaussians: Levenberg-Marquardt ends at the errors of BFGS, but takes 3 to
-100 times as long; with the weights among its unknowns BFGS needs twice the steps. So it is BFGS, weights projected out.
+Measured on slices of four materials, 1 to 7 Gaussians: Levenberg-Marquardt ends at the errors of BFGS, but takes many
+times as long; with the weights among its unknowns BFGS needs more steps. So it is BFGS, weights projected out.
 
 notation: Phi(p) = columns of the lobes at the parameters p (axes, log sharpness), times the root of the solid angles;
 a(p) = the weights that minimise |Phi a - y|^2: variable projection (Golub and Pereyra 1973).
