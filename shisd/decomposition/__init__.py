@@ -1,6 +1,7 @@
 """Stage 2: isotropic spherical decomposition (ISD15), coefficients <-> weights of rotated kernels.
 
-Conventions: axes are unit vectors, z and -z are one axis; weights [..., L+1, K] multiply y_l^0(w . z_k).
+Conventions: axes are unit vectors; weights [..., L+1, K] multiply y_l^0(w . z_k), for which z and -z are one axis, or
+the mother kernels phi_l(w . z_k) of an `IsotropicBasis`. Few lobes with axes of their own: `fit_lobes`.
 """
 
 from shisd.decomposition._basis import RotatedZonalBasis as RotatedZonalBasis
