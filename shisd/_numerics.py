@@ -52,6 +52,12 @@ def cross(a: Vector, b: Vector) -> Array:
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+def same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
+    """Both in the dtype that they promote to, also where JAX promotes nothing by itself."""
+    dtype = jnp.promote_types(a.dtype, b.dtype)
+    return a.astype(dtype), b.astype(dtype)
+
+
 def times(a: Array, b: Array) -> Array:
     """Products of arrays whose axes broadcast from the last one, whatever their number."""
     shape = jnp.broadcast_shapes(a.shape, b.shape)

@@ -20,7 +20,7 @@ from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import normalize, same_dtype
 from shisd._typing import Array, Float
 from shisd.decomposition._directions import check_count
 from shisd.harmonics import sh_basis
@@ -96,7 +96,7 @@ class RotatedZonalBasis(eqx.Module):
         # sum_l a_l P_l(x) = b_0,  b_l = a_l + (2l+1)/(l+1) x b_{l+1} - (l+1)/(l+2) b_{l+2}
         b, after = jnp.zeros_like(x), jnp.zeros_like(x)
         for l in range(self.degree, -1, -1):
-            a = jnp.broadcast_to(weights[..., l, :], shape) / pi(self.degree)[l].item()
+            a = jnp.broadcast_to(weights[..., l, :], shape) / _pi(self.degree)[l].item()
             b, after = a + (2 * l + 1) / (l + 1) * x * b - (l + 1) / (l + 2) * after, b
         return jnp.sum(b, axis=-1)
 
@@ -113,20 +113,24 @@ class RotatedZonalBasis(eqx.Module):
     def _matrices(self) -> Float[Array, "{self.degree}+1 2*{self.degree}+1 {self.size}"]:
         """M_l of all bands, stacked; zero in rows beyond the 2l+1 of a band and in columns of axes it does not use."""
         index, mask = padding(self.degree)
-        y = sh_basis(unit_axes(self.directions), self.degree)
-        m = jnp.moveaxis(y, 0, -1)[index] * jnp.asarray(pi(self.degree), dtype=y.dtype)[:, None, None]
-        return used_only(jnp.where(mask[:, :, None], m, 0).swapaxes(0, 1), self.nested).swapaxes(0, 1)
+        y = jnp.swapaxes(sh_basis(unit_axes(self.directions), self.degree), 0, 1)
+        m = jnp.where(mask.T[:, :, None], y[index.T], 0) * jnp.asarray(_pi(self.degree), dtype=y.dtype)[None, :, None]
+        return jnp.swapaxes(used_only(m, self.nested), 0, 1)
 
 
 def weights_by_band(
     m: Float[Array, "bands n K"], c: Float[Array, "*batch coefs"], degree: int, ridge: float = 0.0
 ) -> Float[Array, "*batch bands K"]:
     """Weights of least norm for matrices M_l that are stacked and padded as `padding` says."""
-    index, mask = padding(degree)
-    padded = jnp.where(mask, c[..., index], 0)  # [*batch, L+1, 2L+1]
-    columns = jnp.moveaxis(padded.reshape(-1, *mask.shape), 0, -1)  # [L+1, 2L+1, batch]
-    weights = minimum_norm(m, columns, mask, [_unresolved(l) for l in range(degree + 1)], ridge)
+    messages = [_unresolved(l) for l in range(degree + 1)]
+    weights = minimum_norm(m, by_band(c, degree), padding(degree)[1], messages, ridge)
     return jnp.moveaxis(weights, -1, 0).reshape(*c.shape[:-1], *weights.shape[:-1])
+
+
+def by_band(c: Float[Array, "*batch coefs"], degree: int) -> Float[Array, "bands n columns"]:
+    """Coefficients as columns, one band above another, padded as `padding` says."""
+    index, mask = padding(degree)
+    return jnp.moveaxis(jnp.where(mask, c.reshape(-1, c.shape[-1])[:, index], 0), 0, -1)
 
 
 def minimum_norm(
@@ -212,11 +216,6 @@ def used_only(values: Float[Array, "*batch l k"], nested: bool) -> Float[Array, 
     return jnp.where(jnp.broadcast_to(used, values.shape), values, 0)
 
 
-def same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
-    dtype = jnp.promote_types(a.dtype, b.dtype)
-    return a.astype(dtype), b.astype(dtype)
-
-
 @functools.cache
 def padding(degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Where band l, padded to 2L+1 entries, finds its coefficients, and which entries are real: both [L+1, 2L+1]."""
@@ -226,6 +225,6 @@ def padding(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @functools.cache
-def pi(degree: int) -> np.ndarray:
+def _pi(degree: int) -> np.ndarray:
     """pi_l = sqrt(4 pi / (2l+1)) of ISD15 Eq. 9."""
     return np.sqrt(4 * np.pi / (2 * np.arange(degree + 1) + 1))

@@ -117,8 +117,9 @@ def conditioning_loss(
     Derivatives: in directions, first order, both modes, also where eigenvalues meet, because the sums are symmetric in
     them. Infinite or NaN for singular sets.
     """
-    z, degree = _axes(directions, degree)
-    return _loss(z, jnp.asarray(power, dtype=z.dtype), degree, bool(nested), _bands(bands, degree))
+    z, degree = _checks.vectors("directions", directions), _checks.degree(degree)
+    check_count(z, degree)
+    return _loss(normalize(z), jnp.asarray(power, dtype=z.dtype), degree, bool(nested), _bands(bands, degree))
 
 
 def optimize_directions(
@@ -148,8 +149,8 @@ def optimize_directions(
     Cost: at each step the eigenvalues of a K x K matrix for every band; `make bench` reports the time.
     """
     starts = _checks.vectors("directions", directions)
-    several = starts.ndim == 3 and len(starts) > 0
-    degree = _axes(starts[0] if several else starts, degree)[1]
+    several, degree = starts.ndim == 3 and len(starts) > 0, _checks.degree(degree)
+    check_count(starts[0] if several else starts, degree)
     if mirror not in (None, "x", "y", "z"):
         raise ValueError(f"`mirror` must be None, 'x', 'y' or 'z'; got {mirror!r}.")
     if mirror is not None and starts.shape[-2] % 2 == 0:
@@ -220,12 +221,6 @@ def _bands(bands: Sequence[int] | None, degree: int) -> tuple[int, ...]:
     if not chosen or max(chosen) > degree:
         raise ValueError(f"`bands` must hold at least one degree, none above {degree}; got {list(chosen)}.")
     return chosen
-
-
-def _axes(directions: ArrayLike, degree: int) -> tuple[Float[Array, "K 3"], int]:
-    z, degree = _checks.vectors("directions", directions), _checks.degree(degree)
-    check_count(z, degree)
-    return normalize(z), degree
 
 
 def check_count(directions: Array, degree: int) -> None:

@@ -76,7 +76,7 @@ def fit_lobes(
     Derivatives: none; differentiate `evaluate` or `coefficients` of the result.
     Accuracy: mixtures of 1, 3 and 7 Gaussians are found again from 861 samples and 3 starts, their axes within 1e-9 rad
     in float64 and 4e-6, 3e-4 and 1e-3 rad in float32.
-    Cost: steps x N x (columns)^2; a slice of a material in 1200 samples takes 2, 18 and 60 ms for 1, 3 and 7 Gaussians.
+    Cost: steps x N x (columns)^2; `make bench` reports the time.
     """
     if not ridge >= 0:
         raise ValueError(f"`ridge` must be >= 0; got {ridge}.")

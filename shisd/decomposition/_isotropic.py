@@ -12,19 +12,21 @@ number of Gaussians at degree 20 falls from 2e4 to 70. And the axes of the level
 `directions` may hold a list per level, which is what kernels that live near their axis need (ISD15 section 7.2).
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 
 from shisd import _checks
-from shisd._numerics import normalize, safe_sqrt
+from shisd._numerics import normalize, safe_sqrt, same_dtype
 from shisd._typing import Array, Float, Scalar
 from shisd.decomposition import _basis
 from shisd.decomposition._directions import check_count
 from shisd.decomposition._kernels import AbstractKernel
-from shisd.harmonics import _tables, evaluate, sample_map, sh_basis, synthesize_map
+from shisd.harmonics import convolve, evaluate, sample_map, sh_basis, synthesize_map
 
 
 class Decomposition(eqx.Module):
@@ -104,10 +106,8 @@ class IsotropicBasis(eqx.Module):
     def matrix(self) -> Float[Array, "n {self.degree}+1 {self.size}"]:
         """M of ISD15 Eq. 17 as [(L+1)^2, L+1, K]; zero for axes that a nested level does not use."""
         y = sh_basis(_basis.unit_axes(self.directions), self.degree)  # [*levels, K, n]
-        y = jnp.broadcast_to(jnp.moveaxis(y, -1, 0).reshape(y.shape[-1], -1, self.size), self._shape)
-        band = _tables.bands(self.degree)
-        factor = (self.zonal() * jnp.asarray(_basis.pi(self.degree), y.dtype)[None])[:, band]
-        return _basis.used_only(y * factor.T[:, :, None], self.nested)
+        m = convolve(y, self.zonal()[:, None])  # a delta at the axis, convolved with the kernel
+        return _basis.used_only(jnp.moveaxis(m, -1, 0), self.nested)
 
     @eqx.filter_jit
     def weights(self, coefficients: ArrayLike, *, ridge: float = 0.0) -> Float[Array, "*batch l k"]:
@@ -118,13 +118,13 @@ class IsotropicBasis(eqx.Module):
         Accuracy: coefficients come back within 10 eps times the condition number, for every kernel here.
         Cost: one QR of [(L+1) K, (L+1)^2]; for `LegendreKernel` band by band.
         """
-        c, m = _basis.same_dtype(_basis.check_coefficients(coefficients, self.degree), self.matrix())
+        c, m = same_dtype(_basis.check_coefficients(coefficients, self.degree), self.matrix())
         return self._solve(m, c, _ridge(ridge))
 
     @eqx.filter_jit
     def solve(self, coefficients: ArrayLike, *, ridge: float = 0.0) -> Decomposition:
         """`weights`, with their residual and the condition number of M."""
-        c, m = _basis.same_dtype(_basis.check_coefficients(coefficients, self.degree), self.matrix())
+        c, m = same_dtype(_basis.check_coefficients(coefficients, self.degree), self.matrix())
         weights = self._solve(m, c, _ridge(ridge))
         norm = lambda a: safe_sqrt(jnp.sum(a * a, axis=-1))
         size = norm(c)
@@ -135,7 +135,7 @@ class IsotropicBasis(eqx.Module):
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
         """SH coefficients [..., (L+1)^2] of a weighted sum, c = M lambda, from `weights` [..., L+1, K]."""
         weights = _basis.check_weights(weights, self.degree, self.size, self.nested)
-        weights, m = _basis.same_dtype(weights, self.matrix())
+        weights, m = same_dtype(weights, self.matrix())
         return _apply(m, weights)
 
     def evaluate(self, weights: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
@@ -159,7 +159,7 @@ class IsotropicBasis(eqx.Module):
 
         Arguments: `weights` [..., L+1, K] of the kernel and `rotations` R [..., 3, 3] that turn it into the frame of
         the signal; leading axes broadcast. `signal` [*colour, (L+1)^2], SH coefficients. Returns [..., *colour].
-        Accuracy: exact up to rounding: 10 eps times the norms of weights and signal (tests).
+        Accuracy: exact up to rounding, 10 eps times the condition number (tests).
         Cost: for every rotation the harmonics at all axes; memory does not grow with the number of rotations.
         """
         signal = _basis.check_coefficients(signal, self.degree)
@@ -196,10 +196,6 @@ class IsotropicBasis(eqx.Module):
 
         return self._turned(one, weights, rotations, texels.dtype)
 
-    @property
-    def _shape(self) -> tuple[int, int, int]:
-        return (self.degree + 1) ** 2, self.degree + 1, self.size
-
     def _blocks(self, m: Float[Array, "n l k"]) -> Float[Array, "l rows k"]:
         """The blocks M_l of a kernel whose level l is band l, stacked and padded."""
         index, mask = _basis.padding(self.degree)
@@ -223,13 +219,13 @@ class IsotropicBasis(eqx.Module):
         return jnp.max(s[:, 0]) / jnp.min(s[levels, 2 * levels])
 
     def _filtered(self, signal: Float[Array, "*colour n"]) -> Float[Array, "levels *colour n"]:
-        """Coefficients of f * phi_l: beta[l, n] pi_n f_n^m."""
-        band = _tables.bands(self.degree)
-        factor = (self.zonal() * jnp.asarray(_basis.pi(self.degree), self.directions.dtype)[None])[:, band]
-        factor, signal = _basis.same_dtype(factor, signal)
-        return factor.reshape(-1, *(1,) * (signal.ndim - 1), signal.shape[-1]) * signal[None]
+        """Coefficients of f * phi_l."""
+        levels = self.degree + 1
+        return convolve(signal, self.zonal().reshape(levels, *(1,) * (signal.ndim - 1), levels))
 
-    def _turned(self, one, weights: ArrayLike, rotations: ArrayLike, dtype) -> Array:
+    def _turned(
+        self, one: Callable[[Array, Array], Array], weights: ArrayLike, rotations: ArrayLike, dtype: DTypeLike
+    ) -> Array:
         """one(weights, R z) for all rotations."""
         weights = _basis.check_weights(weights, self.degree, self.size, self.nested)
         r = _checks.real_array("rotations", rotations)

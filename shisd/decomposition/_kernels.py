@@ -29,7 +29,7 @@ from shisd.harmonics import _quadrature, _tables, legendre, zonal_basis
 from shisd.harmonics._zh import legendre_of_versine
 
 
-def _widths(name: str) -> Callable[[ArrayLike | None], Array | None]:
+def _per_level(name: str) -> Callable[[ArrayLike | None], Array | None]:
     """A converter for a field with one width per level."""
 
     def convert(value: ArrayLike | None) -> Array | None:
@@ -43,7 +43,9 @@ def _widths(name: str) -> Callable[[ArrayLike | None], Array | None]:
     return convert
 
 
-def _laws(widths: Array | None, degree: int, law: Callable[[int], float], dtype: DTypeLike) -> Float[Array, " levels"]:
+def _widths(
+    widths: Array | None, degree: int, law: Callable[[int], float], dtype: DTypeLike
+) -> Float[Array, " levels"]:
     """The widths of levels 0 ... `degree`, given or by a law."""
     if widths is None:
         return jnp.asarray([law(l) for l in range(degree + 1)], dtype)
@@ -51,11 +53,6 @@ def _laws(widths: Array | None, degree: int, law: Callable[[int], float], dtype:
         raise ValueError(f"The kernel has widths for {len(widths)} levels; degree {degree} needs {degree + 1}.")
     widths = widths[: degree + 1].astype(dtype)
     return eqx.error_if(widths, ~jnp.all(widths >= 0), "The widths of the kernel must be finite and not negative.")
-
-
-def _law(widths: Array | None, level: int, law: int | float, dtype: DTypeLike) -> Scalar:
-    level = _checks.integer("level", level)
-    return jnp.asarray(law, dtype) if widths is None else widths[level].astype(dtype)
 
 
 class AbstractKernel(eqx.Module):
@@ -90,57 +87,65 @@ class LegendreKernel(AbstractKernel):
         return jnp.eye(_checks.degree(degree) + 1, dtype=dtype)
 
 
-class GaussianKernel(AbstractKernel):
+class _BellKernel(AbstractKernel):
+    """What is made of exp(-sharpness[l] (1 - x))."""
+
+    sharpness: Float[Array, " levels"] | None = eqx.field(converter=_per_level("sharpness"), default=None)
+
+    def _sharpness(self, degree: int, dtype: DTypeLike) -> Float[Array, " levels"]:
+        return _widths(self.sharpness, degree, lambda l: l**2, dtype)
+
+    def _bell(self, x: Array, level: int) -> tuple[Array, Scalar]:
+        """The Gaussian of a level, and its sharpness."""
+        k = self._sharpness(_checks.integer("level", level), x.dtype)[-1]
+        return jnp.exp(-k * (1 - x)), k
+
+
+class GaussianKernel(_BellKernel):
     """Spherical Gaussians phi_l = exp(-sharpness[l] (1 - x)), by default with sharpness l^2 (ISD15 Eq. 19).
 
     Arguments: `sharpness` [levels] >= 0, or None for l^2. Positive everywhere, at most 1.
     """
 
-    sharpness: Float[Array, " levels"] | None = eqx.field(converter=_widths("sharpness"), default=None)
-
     def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
         x = _checks.real_array("x", x)
-        return jnp.exp(-_law(self.sharpness, level, level**2, x.dtype) * (1 - x))
+        return self._bell(x, level)[0]
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
-        return gaussian_zonal(_laws(self.sharpness, degree, lambda l: l**2, dtype), degree)
+        return gaussian_zonal(self._sharpness(degree, dtype), degree)
 
 
-class VonMisesFisherKernel(AbstractKernel):
+class VonMisesFisherKernel(_BellKernel):
     """Gaussians of unit integral, phi_l = k / (4 pi sinh k) exp(k x) with k = sharpness[l], by default l^2.
 
     Source: ISD15 Eq. 30. Arguments: as `GaussianKernel`. A filter with such a kernel keeps the mean.
     """
 
-    sharpness: Float[Array, " levels"] | None = eqx.field(converter=_widths("sharpness"), default=None)
-
     def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
         x = _checks.real_array("x", x)
-        k = _law(self.sharpness, level, level**2, x.dtype)
-        return jnp.exp(-k * (1 - x)) / _gaussian_integral(k)
+        bell, k = self._bell(x, level)
+        return bell / _gaussian_integral(k)
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
-        k = _laws(self.sharpness, degree, lambda l: l**2, dtype)
+        k = self._sharpness(degree, dtype)
         return gaussian_zonal(k, degree) / _gaussian_integral(k)[:, None]
 
 
-class GaussLegendreKernel(AbstractKernel):
+class GaussLegendreKernel(_BellKernel):
     """phi_l = exp(-sharpness[l] (1 - x)) P_l(x), by default with sharpness l^2: zonal harmonics kept near their axis.
 
     Arguments: as `GaussianKernel`. Source: ISD15 section 7.2, "Gauss-Legendre".
     """
 
-    sharpness: Float[Array, " levels"] | None = eqx.field(converter=_widths("sharpness"), default=None)
-
     def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
         x = _checks.real_array("x", x)
-        return jnp.exp(-_law(self.sharpness, level, level**2, x.dtype) * (1 - x)) * legendre(x, level)[..., -1]
+        return self._bell(x, level)[0] * legendre(x, level)[..., -1]
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
-        k = _laws(self.sharpness, degree, lambda l: l**2, dtype)
+        k = self._sharpness(degree, dtype)
         t, p, weights = _near_axis(_extent(k), degree, degree + _NODES)
         levels = np.arange(degree + 1, dtype=np.int32)
         own = p[levels, :, levels] / jnp.asarray(_tables.zonal_norms(degree), k.dtype)[:, None]  # P_l at its own nodes
@@ -155,17 +160,17 @@ class PhongKernel(AbstractKernel):
     over [0, 1], from I_0 = 1 / (a+1) and I_1 = 1 / (a+2).
     """
 
-    exponents: Float[Array, " levels"] | None = eqx.field(converter=_widths("exponents"), default=None)
+    exponents: Float[Array, " levels"] | None = eqx.field(converter=_per_level("exponents"), default=None)
 
     def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
         x = _checks.real_array("x", x)
-        a = _law(self.exponents, level, 4 * level, x.dtype)
+        a = self._exponents(_checks.integer("level", level), x.dtype)[-1]
         above = jnp.where(x > 0, jnp.where(x > 0, x, 1) ** a, 0)
         return jnp.where(a == 0, 1, above)
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
-        a = _laws(self.exponents, degree, lambda l: 4 * l, dtype)[:, None]
+        a = self._exponents(degree, dtype)[:, None]
         n = np.arange(degree + 1)[None].astype(a.dtype)
         steps = jnp.where(n > 1, (a - n + 2) / (a + n + 1), 1 / (a + n + 1))  # from n - 2 to n
         even, odd = (jnp.cumprod(steps[:, i::2], axis=1) for i in (0, 1))
@@ -173,27 +178,33 @@ class PhongKernel(AbstractKernel):
         integrals = jnp.where(a == 0, jnp.where(n == 0, 2, 0).astype(a.dtype), integrals)
         return integrals * jnp.asarray(2 * np.pi * _tables.zonal_norms(degree), a.dtype)[None]
 
+    def _exponents(self, degree: int, dtype: DTypeLike) -> Float[Array, " levels"]:
+        return _widths(self.exponents, degree, lambda l: 4 * l, dtype)
+
 
 class CapKernel(AbstractKernel):
     """Discs: phi_l = 1 within angles[l] of the axis, 0 beyond.
 
     Arguments: `angles` [levels] in rad, above 0 and at most pi, or None for 2.405 / (l + 1/2), where P_l has its first
-    zero, at most pi. A filter with such a kernel is a mean over
-    discs. Its values have no derivative in the angle; its coefficients do.
+    zero, at most pi. A filter with such a kernel is a mean over discs. Its values have no derivative in the angle; its
+    coefficients do.
     """
 
-    angles: Float[Array, " levels"] | None = eqx.field(converter=_widths("angles"), default=None)
+    angles: Float[Array, " levels"] | None = eqx.field(converter=_per_level("angles"), default=None)
 
     def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
         x = _checks.real_array("x", x)
-        return (x >= jnp.cos(_law(self.angles, level, _first_zero(level), x.dtype))).astype(x.dtype)
+        return (x >= jnp.cos(self._angles(_checks.integer("level", level), x.dtype)[-1])).astype(x.dtype)
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
-        half = _laws(self.angles, degree, _first_zero, dtype) / 2
-        half = eqx.error_if(half, jnp.any((half <= 0) | (half > 1.6)), "`angles` must be above 0 and at most pi.")
-        _, p, weights = _near_axis(2 * jnp.sin(half) ** 2, degree, degree // 2 + 1)  # exact for polynomials
+        extent = 2 * jnp.sin(self._angles(degree, dtype) / 2) ** 2
+        _, p, weights = _near_axis(extent, degree, degree // 2 + 1)  # exact for polynomials
         return jnp.einsum("lq,lqn->ln", weights, p)
+
+    def _angles(self, degree: int, dtype: DTypeLike) -> Float[Array, " levels"]:
+        angles = _widths(self.angles, degree, lambda l: min(2.405 / (l + 0.5), np.pi), dtype)
+        return eqx.error_if(angles, jnp.any((angles <= 0) | (angles > 3.2)), "`angles` must be above 0 and at most pi.")
 
 
 class FunctionKernel(AbstractKernel):
@@ -271,7 +282,3 @@ def _gaussian_integral(k: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     positive = k > 0
     safe = jnp.where(positive, k, 1)
     return 2 * np.pi * jnp.where(positive, -jnp.expm1(-2 * safe) / safe, 2 - 2 * k)
-
-
-def _first_zero(level: int) -> float:
-    return min(2.405 / (level + 0.5), np.pi)

@@ -9,14 +9,13 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float
 from shisd.decomposition._kernels import gaussian_zonal
-from shisd.harmonics import _tables, sh_basis, zonal_basis
+from shisd.harmonics import convolve, sh_basis, zonal_basis
 
 
 class AbstractLobes(eqx.Module):
@@ -152,8 +151,4 @@ def _axes_and_weights(directions: ArrayLike, weights: ArrayLike) -> tuple[Float[
 
 def _rotated(directions: Float[Array, "J 3"], zonal: Float[Array, "*batch J l"]) -> Float[Array, "*batch J n"]:
     """SH coefficients of lobes with the zonal coefficients `zonal` about `directions` (ISD15 Eq. 9)."""
-    degree = zonal.shape[-1] - 1
-    pi = jnp.asarray(np.sqrt(4 * np.pi / (2 * np.arange(degree + 1) + 1)), zonal.dtype)
-    turned = sh_basis(normalize(directions).astype(zonal.dtype), degree)
-    spread = (zonal * jnp.broadcast_to(pi, zonal.shape))[..., _tables.bands(degree).astype(np.int32)]
-    return spread * jnp.broadcast_to(turned, spread.shape)
+    return convolve(sh_basis(normalize(directions).astype(zonal.dtype), zonal.shape[-1] - 1), zonal)

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._typing import Array, Float
-from shisd.decomposition._basis import RotatedZonalBasis, padding
+from shisd.decomposition._basis import RotatedZonalBasis, by_band
 
 
 def sparse_weights(
@@ -39,9 +39,7 @@ def sparse_weights(
 @eqx.filter_jit
 def _choose(basis: RotatedZonalBasis, c: Float[Array, "*batch n"], count: int) -> tuple[Array, Array]:
     m = basis._matrices().astype(c.dtype)  # [L+1, 2L+1, K]
-    index, mask = padding(basis.degree)
-    target = jnp.where(mask, c.reshape(-1, c.shape[-1])[:, index], 0)
-    target = jnp.moveaxis(target, 0, -1)  # [L+1, 2L+1, B]
+    target = by_band(c, basis.degree)  # [L+1, 2L+1, B]
     tolerance = float(jnp.finfo(c.dtype).eps) ** 0.5
 
     def choose(carry, _):

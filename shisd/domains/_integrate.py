@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import normalize, same_dtype
 from shisd._typing import Array, Float
 from shisd.decomposition import fibonacci_directions, optimized_directions
 from shisd.decomposition._directions import TABLE_DEGREE
@@ -115,7 +115,7 @@ def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "k 
     d = _checked_axes(axes)
     if isinstance(region, SphericalCap):
         return region.zonal_integrals(degree)[None] * legendre(d @ region.axis.astype(d.dtype), degree)
-    v, d = _same_dtype(region.loop(), d)
+    v, d = same_dtype(region.loop(), d)
     angle = jnp.broadcast_to(loop_solid_angle(v, region.largest)[None, None], (1, d.shape[0], 1))
     rest = [_moments.moments(d, v, degree)] if degree else []
     return jnp.concatenate([angle, *rest])[..., 0].T
@@ -123,7 +123,7 @@ def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "k 
 
 @eqx.filter_jit
 def _axial_moments(polygon: SphericalPolygon, axes: Array, order: int) -> Float[Array, "k n"]:
-    v, d = _same_dtype(polygon.loop(), _checked_axes(axes))
+    v, d = same_dtype(polygon.loop(), _checked_axes(axes))
     return _moments.powers(d, v, loop_solid_angle(v, polygon.largest), order)[..., 0].T
 
 
@@ -160,8 +160,3 @@ def zonal_inverse(degree: int, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray
     y = _tables.basis(z, degree)
     bands = [np.linalg.pinv(4 * np.pi / (2 * l + 1) * y[:, l * l : (l + 1) ** 2]) for l in range(degree + 1)]
     return axes, np.concatenate(bands).astype(dtype)
-
-
-def _same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
-    dtype = jnp.promote_types(a.dtype, b.dtype)
-    return a.astype(dtype), b.astype(dtype)

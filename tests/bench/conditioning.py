@@ -12,6 +12,7 @@ from numpy.polynomial import legendre as series
 from scipy.optimize import linprog
 
 from shisd import decomposition, harmonics, models
+from shisd._numerics import normalize
 from tests.bench.make_directions import band_matrix, worst_condition
 from tests.truth import scipy_basis
 
@@ -88,10 +89,10 @@ def bench_objectives(degree=12, starts=6):
 
     def minimise(loss, z, steps):
         solver = optx.BFGS(rtol=1e-8, atol=1e-8)
-        return normalised(optx.minimise(loss, solver, z, max_steps=steps, throw=False).value)
+        return normalize(optx.minimise(loss, solver, z, max_steps=steps, throw=False).value)
 
     def log_det(z, _):
-        z = normalised(z)
+        z = normalize(z)
         y = harmonics.sh_basis(z, degree)
         bands = [y[:, l * l : (l + 1) ** 2] for l in range(degree + 1)]
         return -sum(jnp.linalg.slogdet(m.T @ m)[1] for m in bands)
@@ -121,10 +122,6 @@ def bench_objectives(degree=12, starts=6):
                 "s per start": (time.perf_counter() - began) / starts,
             })  # fmt: skip
     return rows
-
-
-def normalised(z):
-    return z / jnp.linalg.norm(z, axis=-1, keepdims=True)
 
 
 def bench_kernels(degrees=(4, 8, 12, 16, 20)):

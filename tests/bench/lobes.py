@@ -25,7 +25,7 @@ import numpy as np
 from shisd import decomposition, harmonics, models, reference, shading
 from shisd._numerics import normalize
 from shisd.decomposition._kernels import gaussian_zonal
-from shisd.shading import _lobes
+from shisd.shading import _lobes, _surface, _views
 from tests.bench.equation_22 import local_frames
 from tests.bench.timing import interleaved
 from tests.models.materials import GOLD_PAINT, NICKEL
@@ -109,17 +109,13 @@ def slice_samples(brdf, theta, nodes=20):
     return w, jax.vmap(lambda wi: brdf.value_cosine(wi, view))(w).T, area
 
 
-def elevations():
-    return (np.arange(VIEWS) + 0.5) * (np.pi / 2 / VIEWS)
-
-
 @eqx.filter_jit
 def fit_table(brdf, count, degree=None):
     """Fits for all elevations, from the normal to the horizon, with a leading axis: Gaussians, or profiles of a degree.
 
     Each starts from the last one, turned with the mirror direction. The ridges are the best of 0, 1e-4, 1e-3, 1e-2.
     """
-    theta = jnp.asarray(elevations(), jnp.float32)
+    theta = jnp.asarray(_views.elevations(VIEWS), jnp.float32)
     step = np.pi / 2 / VIEWS
     turn = jnp.asarray([[np.cos(step), 0, -np.sin(step)], [0, 1, 0], [np.sin(step), 0, np.cos(step)]], jnp.float32)
     first = slice_samples(brdf, theta[0])
@@ -243,8 +239,8 @@ def shade_gaussians(table, pyramid, normals, views):
     texels, firsts, heights = pyramid
     firsts, heights = jnp.asarray(firsts), jnp.asarray(heights)
 
-    def tile(nv):
-        frames, theta = local_frames(*nv)
+    def tile(rows):
+        frames, theta = local_frames(rows["normals"], rows["views"])
         lobes = jax.vmap(lambda t: interpolated(table, t))(theta)
         w = rotated(frames, lobes.directions)
         level = jnp.clip(2 * jnp.log2(lobes.sharpness) + 2, 0, len(LADDER) - 1.001)
@@ -257,7 +253,7 @@ def shade_gaussians(table, pyramid, normals, views):
         integral = -2 * np.pi * jnp.expm1(-2 * lobes.sharpness) / lobes.sharpness
         return jnp.einsum("pck,pkc->pc", lobes.weights * integral[:, None], total)
 
-    return in_tiles(tile, normals, views)
+    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 256)
 
 
 def band_table(environment, degree, height=128):
@@ -272,21 +268,15 @@ def band_table(environment, degree, height=128):
 
 @eqx.filter_jit
 def shade_profiles(table, texels, normals, views, at, height=128):
-    def tile(nv):
-        frames, theta = local_frames(*nv)
+    def tile(rows):
+        frames, theta = local_frames(rows["normals"], rows["views"])
         lobes = jax.vmap(lambda t: at(table, t))(theta)
         index, weight = bilinear(jnp.asarray(height), rotated(frames, lobes.directions))
         value = jnp.einsum("pkq,pkqx->pkx", weight, texels[index])
         value = value.reshape(*value.shape[:2], -1, 3)
         return jnp.einsum("pclk,pklc->pc", lobes.weights, value)
 
-    return in_tiles(tile, normals, views)
-
-
-def in_tiles(tile, normals, views, size=256):
-    count = len(normals)
-    parts = lambda x: x.reshape(-1, min(size, count), 3)
-    return jax.lax.map(tile, (parts(normals), parts(views))).reshape(count, 3)
+    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 256)
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------
@@ -304,7 +294,7 @@ def sparse_table(brdf, degree, count):
         weights, axes = decomposition.sparse_weights(basis, c, count)
         return decomposition.ZonalLobes(basis.directions[axes], weights[..., axes])
 
-    return jax.lax.map(choose, jnp.asarray(elevations(), jnp.float32))
+    return jax.lax.map(choose, jnp.asarray(_views.elevations(VIEWS), jnp.float32))
 
 
 def timed(function):

@@ -137,6 +137,8 @@ def test_bad_widths_are_refused(as_user):
         decomposition.GaussianKernel(3.0)
     with pytest.raises(ValueError, match="widths for 3 levels; degree 4 needs 5"):
         decomposition.GaussianKernel(np.ones(3)).zonal(4)
+    with pytest.raises(ValueError, match="widths for 3 levels; degree 4 needs 5"):
+        decomposition.PhongKernel(np.ones(3))(np.ones(2), 4)
     with pytest.raises(RuntimeError, match="widths of the kernel must be finite and not negative"):
         decomposition.PhongKernel(np.array([1.0, -1.0])).zonal(1)
     with pytest.raises(RuntimeError, match="`angles` must be above 0 and at most pi"):
