@@ -9,3 +9,6 @@ from shisd.shading._lobes import tabulate_brdf as tabulate_brdf
 from shisd.shading._polygon import project_light as project_light
 from shisd.shading._polygon import shade_polygon as shade_polygon
 from shisd.shading._polygon import shade_portal as shade_portal
+from shisd.shading._prefiltered import PrefilteredLobes as PrefilteredLobes
+from shisd.shading._prefiltered import prefilter as prefilter
+from shisd.shading._prefiltered import shade_prefiltered as shade_prefiltered

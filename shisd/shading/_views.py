@@ -41,13 +41,15 @@ def spline_matrices(count: int) -> np.ndarray:
     return np.stack(matrices)
 
 
-def spline_table(values: Float[Array, "*batch orders v"], orders: np.ndarray) -> Float[Array, "*batch orders coefs"]:
+def spline_table(
+    values: Float[Array, "*batch orders v"], orders: np.ndarray | Array
+) -> Float[Array, "*batch orders coefs"]:
     """Spline coefficients over the last axis of components of the given azimuthal `orders` k >= 0."""
     count = values.shape[-1]
-    quotient = np.where(orders[:, None] > 0, 1 / np.sin(elevations(count)), 1.0)
+    quotient = jnp.where(orders[:, None] > 0, jnp.asarray(1 / np.sin(elevations(count)), values.dtype)[None], 1)
     odd = (orders > 0) & (orders % 2 == 0)  # f_k / sin is odd for even k > 0
     even_matrix, odd_matrix = (jnp.asarray(m.T, values.dtype) for m in spline_matrices(count))
-    scaled = values * jnp.asarray(quotient, values.dtype).reshape((1,) * (values.ndim - 2) + quotient.shape)
+    scaled = values * quotient.reshape((1,) * (values.ndim - 2) + quotient.shape)
     return jnp.where(jnp.broadcast_to(odd[:, None], (*scaled.shape[:-1], 1)), scaled @ odd_matrix, scaled @ even_matrix)
 
 

@@ -1,0 +1,315 @@
+"""Distant light filtered beforehand for one material: radiance from one lookup in maps of few channels.
+
+About an axis s near its centre, a slice has coefficients c_lm(theta_o), m >= 0 (it is even in the azimuth). They are of
+low rank: with few terms r for each order m, c_lm(theta_o) = sum over r of b_mr(l) a_mr(theta_o). By Eq. 22 the radiance
+is then a sum over these channels,
+
+    sum over (m, r) of a_mr(theta_o) (cos(m psi) U_mr(s) + sin(m psi) V_mr(s)),
+
+where U + iV = sum over l of b_mr(l) times the light's coefficients of degree l and order m in a frame (theta, phi, s):
+functions of the direction s alone, tabulated once. For m = 0 they are what ISD15 Eq. 22 looks up, the light filtered
+with a zonal function; one such channel is a split sum (OCCT). The rank is chosen by the mean square error over
+orientations, the sum over bands of |c_l|^2 |e_l|^2 / (2l+1), so channels go where both slices and light have energy.
+
+Around a pole of a map the frame (theta, phi) turns quickly. Hence two charts, with poles on the z and the x axis; each
+is used, and kept, within an eighth of a turn of its equator only.
+
+notation: s = the normal, or the direction mirrored at it; t = sin(theta_o) times the unit vector at s that points to
+the viewer's side (s = normal) or to the normal (s = mirror direction); psi = the angle from the frame's theta to t.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from shisd import _checks
+from shisd._numerics import normalize, safe_sqrt
+from shisd._typing import Array, Float, Scalar
+from shisd.harmonics import _tables, rotate
+from shisd.harmonics._rotation import rotate_many
+from shisd.shading import _views
+from shisd.shading._lobes import Lobes
+from shisd.shading._surface import in_tiles
+
+_TILE = 2048  # pixels at a time
+_ROWS_PER_BAND = 3  # texels from pole to pole for each band: cubic splines are then good to 1e-3 of the highest one
+_CHART_X = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # world to the chart whose pole is x
+
+
+class PrefilteredLobes(eqx.Module):
+    """A material under one distant light, as `prefilter` makes it: `channels` terms, predicted relative `error`.
+
+    `profiles` [V+4, C * colours], splines of a over the elevation of the view; `maps` [texels, M * colours], splines of
+    U and V over two charts; `channel` and `order` [M], of every map; `reduce` and `expand` [C, L+1], from the bands of
+    a slice to channels and back; `mirror`, whether s is the mirror direction. C and M are padded, with zeros, so that
+    most materials share compiled code.
+    """
+
+    profiles: Float[Array, "elevations a"]
+    maps: Float[Array, "texels b"]
+    channel: Array
+    order: Array
+    reduce: Float[Array, "channels l"]
+    expand: Float[Array, "channels l"]
+    mirror: Array
+    channels: Array
+    error: Scalar
+    highest: int = eqx.field(static=True)  # order
+    colours: tuple[tuple[int, ...], tuple[int, ...]] = eqx.field(static=True)  # of the material and of the light
+
+    @property
+    def degree(self) -> int:
+        return self.expand.shape[1] - 1
+
+
+def prefilter(
+    lobes: Lobes, light_coefficients: ArrayLike, *, tolerance: float = 1e-2, like: PrefilteredLobes | None = None
+) -> PrefilteredLobes:
+    """Filter distant light for one isotropic material, once for any number of pixels: see `shade_prefiltered`.
+
+    Arguments: `lobes` and `light_coefficients` as in `shade_environment`; static `tolerance`, the error to aim at: that
+    of radiance relative to its RMS over all orientations and over the views of a sphere, against `shade_environment`.
+    As many channels are kept as that takes; `error` of the result is what is predicted for them, and tests find it
+    right within a factor of 2 on photographed maps.
+    Channels are chosen from values, so not under jit, grad or vmap. There pass `like`, an earlier result: its channels
+    are used again and only the tables are made, a pure function of `lobes` and `light_coefficients`, linear in each.
+    Cost: the light is turned to (3 (L+1))^2 frames for each of two charts, about 0.2 s at degree 30; the maps take
+    10 to 40 MB there, 1 MB at degree 8.
+    Source: ISD15 Eq. 22, whose zonal maps this extends to orders m > 0.
+    """
+    if not isinstance(lobes, Lobes):
+        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
+    if lobes.domain != "sphere":
+        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
+    if not lobes.isotropic:
+        raise ValueError("`lobes` are anisotropic, which no map of one direction can hold; use shade_environment.")
+    e, light_degree = _checks.coefficients("light_coefficients", light_coefficients)
+    if e.ndim > 2:
+        raise ValueError(f"`light_coefficients` must have shape [n] or [colour, n]; got {list(e.shape)}.")
+    if not tolerance > 0:
+        raise ValueError(f"`tolerance` must be > 0; got {tolerance}.")
+    degree = min(light_degree, lobes.degree)
+    dtype = jnp.promote_types(lobes.weights.dtype, e.dtype)
+    e = e[..., : (degree + 1) ** 2].astype(dtype)
+    c = lobes.coefficients()[..., : (degree + 1) ** 2].astype(dtype)
+    c = c.reshape(-1, *c.shape[-2:])
+    if like is None:
+        try:
+            values = np.asarray(c, float), np.asarray(e, float)
+        except jax.errors.TracerArrayConversionError as error:
+            raise ValueError(
+                "channels are chosen from values: call prefilter once outside jit and grad, and pass that as `like`."
+            ) from error
+        like = _choose(*values, tolerance)
+    elif not isinstance(like, PrefilteredLobes) or like.degree != degree:
+        raise ValueError(f"`like` must come from shading.prefilter at degree {degree}.")
+    like = jax.lax.stop_gradient(_as_type(like, dtype))
+    profiles, maps = _filter(c, e.reshape(-1, e.shape[-1]), like)
+    return PrefilteredLobes(
+        profiles, maps, like.channel, like.order, like.reduce, like.expand, like.mirror, like.channels, like.error,
+        like.highest, (lobes.colour, e.shape[:-1]),
+    )  # fmt: skip
+
+
+def shade_prefiltered(
+    prefiltered: PrefilteredLobes, normals: ArrayLike, views: ArrayLike
+) -> Float[Array, "*batch_colour"]:
+    """Radiance that leaves surface points towards the viewer under the light of `prefilter`.
+
+    Arguments: `normals` and `views` as in `shade_environment`. Returns [..., *colour]. A view below the horizon gives
+    0; a zero or NaN normal or view gives NaN.
+    Derivatives: in normals, views and tables, both modes; twice continuous in directions, where the chart changes up to
+    the error of the splines.
+    Accuracy: that of `prefilter`, and 1e-3 of the highest bands, whatever the degree.
+    Cost: 16 texels of all channels; nothing depends on the degree.
+    """
+    if not isinstance(prefiltered, PrefilteredLobes):
+        raise ValueError(f"`prefiltered` must come from shading.prefilter; got {type(prefiltered).__name__}.")
+    n, v = _checks.vectors("normals", normals), _checks.vectors("views", views)
+    try:
+        shape = np.broadcast_shapes(n.shape, v.shape)
+    except ValueError as error:
+        raise ValueError(f"`normals` {list(n.shape)} and `views` {list(v.shape)} do not broadcast.") from error
+    dtype = jnp.result_type(prefiltered.maps, n, v)
+    flat = {k: jnp.broadcast_to(x.astype(dtype), shape).reshape(-1, 3) for k, x in (("normals", n), ("views", v))}
+    radiance = _shade(_as_type(prefiltered, dtype), flat)
+    return radiance.reshape(*shape[:-1], *np.broadcast_shapes(*prefiltered.colours))
+
+
+def _as_type(prefiltered: PrefilteredLobes, dtype: jnp.dtype) -> PrefilteredLobes:
+    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, prefiltered)
+
+
+# ---- choice of channels, on the host
+
+
+def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
+    """The centre that needs fewer maps to meet the tolerance, and its channels; no tables yet."""
+    degree = _checks.degree_of(c.shape[-1])
+    e = e.reshape(-1, e.shape[-1])
+    l = np.arange(degree + 1)
+    energy = np.array([np.mean(np.sum(e[:, k * k : (k + 1) ** 2] ** 2, axis=1)) for k in l]) / (2 * l + 1)
+    theta = _views.elevations(c.shape[1])
+    share = np.sqrt(np.sin(2 * theta) / np.sum(np.sin(2 * theta)))
+    found = []
+    for mirror in (False, True):
+        orders, *rest = _channels(np.asarray(_centred(jnp.asarray(c), mirror)) * share, np.sqrt(energy), tolerance)
+        found.append((len(orders) + np.count_nonzero(orders), mirror, orders, *rest))
+    _, mirror, m, error, reduce, expand = min(found, key=lambda x: x[0])
+    turning = np.flatnonzero(m > 0)
+    channel, order = np.concatenate([np.arange(len(m)), turning]), np.concatenate([m, -m[turning]])
+    spare = 4 - len(m) % 4  # channels of nothing, at least one, of which the spare maps are
+    fill = lambda x: jnp.asarray(np.pad(x, (0, -len(x) % 8), constant_values=len(m)), jnp.int32)
+    rows = lambda x: jnp.asarray(np.pad(x, ((0, spare), (0, 0))), float)
+    highest, none = min(-(-int(m.max()) // 4) * 4, degree), jnp.zeros((0, 0))
+    return PrefilteredLobes(
+        none, none, fill(channel), jnp.where(fill(channel) < len(m), fill(order), 0), rows(reduce), rows(expand),
+        jnp.asarray(mirror), jnp.asarray(len(m), jnp.int32), jnp.asarray(error, float), highest, ((), ()),
+    )  # fmt: skip
+
+
+def _channels(c: np.ndarray, weight: np.ndarray, tolerance: float):
+    """The leading singular vectors over bands of all orders together; c [n, colours, V], weight [L+1]."""
+    degree = len(weight) - 1
+    m = _tables.orders(degree)
+    vectors, values, orders = [], [], []
+    for order in range(degree + 1):
+        rows = np.zeros((degree + 1, c[0].size))
+        rows[order:] = c[m == order].reshape(degree + 1 - order, -1) * weight[order:, None]
+        u, s, _ = np.linalg.svd(rows, full_matrices=False)
+        vectors.append(u.T[: degree + 1 - order])
+        values.append(s[: degree + 1 - order])
+        orders.append(np.full(len(values[-1]), order))
+    vectors, values, orders = (np.concatenate(x) for x in (vectors, values, orders))
+    falling = np.argsort(-values, kind="stable")
+    left = np.sqrt(np.cumsum(values[falling][::-1] ** 2)[::-1] / max(np.sum(values**2), np.finfo(float).tiny))
+    count = max(1, int(np.sum(left > tolerance)))
+    kept = falling[:count]
+    error = float(left[count]) if count < len(left) else 0.0
+    used = weight > 0
+    expand = np.where(used, vectors[kept] / np.where(used, weight, 1), 0)
+    return orders[kept], error, vectors[kept] * weight, expand
+
+
+def _centred(c: Float[Array, "s v n"], mirror: bool | Array) -> Float[Array, "n s v"]:
+    """Coefficients of slices in frames whose z axis is the centre, and whose x axis points to the normal's side."""
+    theta = _views.elevations(c.shape[1])
+    cos, sin, zero, one = np.cos(theta), np.sin(theta), 0 * theta, 0 * theta + 1
+    turn = np.stack([[cos, zero, sin], [zero, one, zero], [-sin, zero, cos]]).transpose(2, 0, 1)  # rows: x, y, z
+    turn = jnp.where(mirror, jnp.asarray(turn, c.dtype), jnp.eye(3, dtype=c.dtype)[None])
+    return rotate_many(jnp.moveaxis(c, -1, 0), turn, _checks.degree_of(c.shape[-1]))
+
+
+# ---- tables
+
+
+@eqx.filter_jit
+def _filter(c: Float[Array, "s v n"], e: Float[Array, "s2 n"], like: PrefilteredLobes) -> tuple[Array, Array]:
+    """`profiles` and `maps` of `PrefilteredLobes`."""
+    degree = like.degree
+    m = jnp.zeros(len(like.reduce), jnp.int32).at[like.channel].max(like.order)
+    a = _of_orders(like.reduce, m, degree) @ _centred(c, like.mirror).reshape(c.shape[-1], -1)
+    a = jnp.swapaxes(a.reshape(len(m), *c.shape[:2]), 0, 1)
+    profiles = _views.spline_table(a, m)  # [s, channels, V+4]
+    combine = _of_orders(like.expand[like.channel], like.order, degree)
+    charts = [e, rotate(e, jnp.asarray(_CHART_X, e.dtype))]
+    maps = jnp.concatenate([_chart(x, combine, like.order, degree) for x in charts])
+    return jnp.moveaxis(profiles, -1, 0).swapaxes(1, 2).reshape(profiles.shape[-1], -1), maps
+
+
+def _of_orders(factors: Float[Array, "rows l"], m: Array, degree: int) -> Float[Array, "rows n"]:
+    """From coefficients to sums over bands of their orders m, one for each row."""
+    return jnp.where(_tables.orders(degree)[None] == m[:, None], factors[:, _tables.bands(degree)], 0)
+
+
+def _grid(degree: int) -> tuple[int, int, int]:
+    """Rows from pole to pole, and the first and the number of those that a chart keeps."""
+    rows = 4 * -(-_ROWS_PER_BAND * (degree + 1) // 4)
+    return rows, rows // 4 - 2, rows // 2 + 5
+
+
+def _chart(e: Float[Array, "s n"], combine: Array, m: Array, degree: int) -> Float[Array, "texels maps"]:
+    """Spline coefficients of all maps over the belt of one chart, colours last."""
+    rows, first, kept = _grid(degree)
+    theta, phi = np.meshgrid(
+        np.pi * (np.arange(rows) + 0.5) / rows, np.pi * (np.arange(2 * rows) + 0.5) / rows, indexing="ij"
+    )
+    sin, cos, c, s = np.sin(theta), np.cos(theta), np.cos(phi), np.sin(phi)
+    frames = np.stack([[cos * c, cos * s, -sin], [-s, c, 0 * c], [sin * c, sin * s, cos]])  # [axis, xyz, ...]
+    frames = jnp.asarray(frames.transpose(2, 3, 0, 1).reshape(rows, -1, 3, 3), e.dtype)  # a row of texels at a time
+
+    def row(turn: Array) -> Array:
+        light = rotate_many(e, turn, degree)  # [n, s, p]
+        return jnp.moveaxis(jnp.tensordot(combine, light, 1), -1, 0)
+
+    values = jax.lax.map(jax.checkpoint(row), frames)  # [rows, 2 rows, maps, s]
+    # past a pole: the other side, in a frame turned by half a turn
+    sign = jnp.where(m % 2 == 0, 1, -1)[:, None].astype(e.dtype)
+    around = jnp.concatenate([values, jnp.roll(values[::-1], rows, axis=1) * sign])
+    k = np.fft.fftfreq(2 * rows) * 2 * np.pi
+    symbol = (2 + np.cos(k)) / 3
+    spectrum = jnp.fft.fft2(around, axes=(0, 1)) / jnp.asarray(np.outer(symbol, symbol)[..., None, None], e.dtype)
+    splines = jnp.fft.ifft2(spectrum, axes=(0, 1)).real
+    columns = np.arange(-2, 2 * rows + 2) % (2 * rows)
+    return splines[first : first + kept][:, columns].reshape(kept * len(columns), -1)
+
+
+# ---- lookups
+
+
+@eqx.filter_jit
+def _shade(lobes: PrefilteredLobes, points: dict[str, Float[Array, "p 3"]]) -> Float[Array, "p colour"]:
+    channel, order = lobes.channel, lobes.order
+    material, light = (int(np.prod(c)) for c in lobes.colours)
+    rows, first, kept = _grid(lobes.degree)
+    width = 2 * rows + 4
+
+    def shade(tile: dict[str, Array]) -> Float[Array, "p colour"]:
+        n, v = normalize(tile["normals"]), normalize(tile["views"])
+        cosine = jnp.sum(n * v, axis=1)
+        across = v - cosine[:, None] * n
+        reflected = cosine[:, None] * n - across
+        s = jnp.where(lobes.mirror, reflected, n)
+        t = jnp.where(lobes.mirror, n - cosine[:, None] * reflected, across)
+        polar = s[:, 2] ** 2 > 0.5
+        s, t = (jnp.where(polar[:, None], jnp.roll(x, -1, axis=1), x) for x in (s, t))
+        rho = jnp.sqrt(s[:, 0] ** 2 + s[:, 1] ** 2)
+        c, d = s[:, 0] / rho, s[:, 1] / rho
+        along = s[:, 2] * (t[:, 0] * c + t[:, 1] * d) - rho * t[:, 2]
+        cos, sin = _views.azimuth_factors(
+            jnp.stack([along, t[:, 1] * c - t[:, 0] * d, cosine], axis=1), lobes.highest + 1
+        )
+        row, weight = _cubic(jnp.arctan2(rho, s[:, 2]) * (rows / np.pi) - 0.5)
+        column, weight_2 = _cubic((jnp.arctan2(s[:, 1], s[:, 0]) % (2 * np.pi)) * (rows / np.pi) - 0.5)
+        corner = (jnp.clip(row - 1 - first, 0, kept - 4) + kept * polar) * width + jnp.clip(column + 1, 0, width - 4)
+        looked = _lookup(
+            lobes.maps, corner, [(i * width + j, a * b) for i, a in enumerate(weight) for j, b in enumerate(weight_2)]
+        )
+        elevation, weight = _cubic(
+            jnp.arctan2(safe_sqrt(1 - cosine * cosine), cosine) * ((lobes.profiles.shape[0] - 4) * 2 / np.pi) - 0.5
+        )
+        elevation = jnp.clip(elevation + 1, 0, lobes.profiles.shape[0] - 4)
+        a = _lookup(lobes.profiles, elevation, list(enumerate(weight))).reshape(-1, lobes.reduce.shape[0], material)
+        waves = jnp.where((order >= 0)[:, None], cos[jnp.abs(order)], sin[jnp.abs(order)]).T  # [p, maps]
+        terms = waves[..., None] * a[:, channel] * looked.reshape(-1, len(order), light)
+        sums = jnp.tile(jnp.eye(terms.shape[-1], dtype=a.dtype), (len(order), 1))  # a product: jnp.sum is slow here
+        total = terms.reshape(-1, sums.shape[0]) @ sums
+        return jnp.where((cosine < 0)[:, None], 0, total)
+
+    return in_tiles(shade, points, _TILE)
+
+
+def _cubic(x: Float[Array, " p"]) -> tuple[Array, list[Array]]:
+    """The node below, and the weights of cubic B-splines at it, one before and two after."""
+    below = jnp.floor(x)
+    t = x - below
+    u = 1 - t
+    weights = [u**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * u**2 + 3 * u**3) / 6, t**3 / 6]
+    return below.astype(jnp.int32), weights
+
+
+def _lookup(table: Float[Array, "rows n"], row: Array, taps: list[tuple[int, Array]]) -> Float[Array, "p n"]:
+    """Weighted sums of rows: whole rows are fetched, which is one pass over contiguous numbers."""
+    return sum(w[:, None] * table.at[row + offset].get(mode="promise_in_bounds") for offset, w in taps)
