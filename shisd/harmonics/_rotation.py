@@ -57,7 +57,7 @@ def rotate_many(
 
     `upright` promises that R z has y = 0 <= x, so that a = 0 and the last turn is left out.
     """
-    a, b, (cos_g, sin_g) = _turns(r, degree)
+    a, b, (cos_g, sin_g) = turns(r, degree)
     return _finish(_swap_turned(c, cos_g, sin_g, degree), None if upright else a, b, degree)
 
 
@@ -86,17 +86,17 @@ def _rotate_many_away_from_pole(c: Array, r: Float[Array, "p 3 3"], degree: int)
     """
     quarter = jnp.asarray([[1, 0, 0], [0, 0, -1], [0, 1, 0]], r.dtype)
     near = r[:, 2, 2] ** 2 > 0.5
-    a, b, (cos_g, sin_g) = _turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
+    a, b, (cos_g, sin_g) = turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
     flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[:, None, None], c.dtype)
     shared = c.ndim == 2
-    quartered = _swap(c.T[..., None] if shared else c, degree) * flip
+    quartered = swap(c.T[..., None] if shared else c, degree) * flip
     quartered = quartered[..., 0].T if shared else quartered
     turned = (_swap_turned(x, cos_g, sin_g, degree) for x in (quartered, c))
     x = jnp.where(near[None, None], *turned)
     return _finish(x, a, b, degree)
 
 
-def _turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
+def turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
     """Cosines and sines [L+1, p] of the multiples of the three angles of each rotation."""
     return [list(angle_multiples(cos, sin, degree + 1)) for cos, sin in _angles(r)]
 
@@ -104,7 +104,7 @@ def _turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
 def _finish(x: Float[Array, "n f p"], a: list[Array] | None, b: list[Array], degree: int) -> Float[Array, "n f p"]:
     """Z(a) J Z(-b) of x: the turn about y is J Z(-b) J, whose first exchange is already in x."""
     cos_b, sin_b = b
-    x = _swap(_turn(x, cos_b, -sin_b, degree), degree)
+    x = swap(_turn(x, cos_b, -sin_b, degree), degree)
     return x if a is None else _turn(x, a[0], a[1], degree)
 
 
@@ -125,7 +125,7 @@ def _turn(x: Float[Array, "n f p"], cos: Array, sin: Array, degree: int) -> Floa
     return cos[np.abs(m)][:, None] * x + (sign * sin[np.abs(m)])[:, None] * x[l * l + l - m]
 
 
-def _swap(x: Float[Array, "n f p"], degree: int) -> Float[Array, "n f p"]:
+def swap(x: Float[Array, "n f p"], degree: int) -> Float[Array, "n f p"]:
     """y and z exchanged: J_l on every band."""
     bands = [
         jnp.tensordot(jnp.asarray(j, x.dtype), x[l * l : (l + 1) ** 2], 1)
@@ -135,9 +135,9 @@ def _swap(x: Float[Array, "n f p"], degree: int) -> Float[Array, "n f p"]:
 
 
 def _swap_turned(c: Array, cos: Array, sin: Array, degree: int) -> Float[Array, "n f p"]:
-    """`_swap` of `_turn`; of coefficients [f, n] that all rotations share, one product with the cosines and sines."""
+    """`swap` of `_turn`; of coefficients [f, n] that all rotations share, one product with the cosines and sines."""
     if c.ndim == 3:
-        return _swap(_turn(c, cos, sin, degree), degree)
+        return swap(_turn(c, cos, sin, degree), degree)
     cosine, sine = [], []
     for l, j in enumerate(_tables.swap_matrices(degree)):
         plus, minus = c[None, :, l * l + l : (l + 1) ** 2], c[None, :, l * l : l * l + l + 1][..., ::-1]

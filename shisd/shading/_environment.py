@@ -11,16 +11,16 @@ notation: R = (t, b, n) local to world; e = light coefficients; R^T e = light in
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import times
 from shisd._typing import Array, Float
-from shisd.harmonics._rotation import rotate_many
-from shisd.shading._lobes import Lobes, lookup_table
+from shisd.harmonics._pairing import pair_many
+from shisd.shading._lobes import Lobes, slice_orders
 from shisd.shading._surface import shade_tiles, surface
 
-_NUMBERS_AT_ONCE = 1 << 19  # coefficients of turned light held at a time: what one tile of pixels needs stays in cache
+_NUMBERS_AT_ONCE = 1 << 18  # coefficients of slices held at a time: what one tile of pixels needs stays in cache
 
 
 def shade_environment(
@@ -64,11 +64,13 @@ def _shade(
     lobes: Lobes, e: Float[Array, "*c n"], points: dict[str, Float[Array, "p 3"]], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     degree = _checks.degree_of(e.shape[-1])
+    look_up = slice_orders(lobes, degree)
 
-    def radiance(frame: Float[Array, "p 3 3"], slices: Float[Array, "*s n p"]) -> Float[Array, "*colour p"]:
-        light = rotate_many(e.reshape(-1, e.shape[-1]), jnp.swapaxes(frame, 1, 2), degree, lobes.isotropic)
-        light = jnp.moveaxis(light.reshape(light.shape[0], *e.shape[:-1], -1), 0, -2)
-        return jnp.sum(times(slices, light), axis=-2)
+    def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
+        to_local = jnp.swapaxes(frame, 1, 2)
+        values = pair_many(*look_up(local), e.reshape(-1, e.shape[-1]), to_local, degree, lobes.isotropic)
+        return values.reshape(*colour, -1)
 
-    size = min(2048, 1 << max(1, _NUMBERS_AT_ONCE // e.size).bit_length() - 1)
-    return shade_tiles(lobes, lookup_table(lobes, degree), points, colour, size, radiance)
+    numbers = (degree + 1) ** 2 * int(np.prod(lobes.colour))
+    size = min(2048, 1 << max(1, _NUMBERS_AT_ONCE // numbers).bit_length() - 1)
+    return shade_tiles(lobes, points, colour, size, radiance)

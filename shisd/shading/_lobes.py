@@ -8,6 +8,7 @@ a = the unit vector at r that points up, b = horizontal; w is above the horizon 
 """
 
 import functools
+from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from shisd import _checks
 from shisd._typing import Array, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import _tables, sh_basis
+from shisd.harmonics._pairing import rows
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 
@@ -87,21 +89,45 @@ def lookup_table(lobes: Lobes, degree: int | None = None) -> Float[Array, "*colo
 
 def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p 3"], lobes: Lobes) -> Array:
     """Interpolated SH coefficients of the slices, in the local frame: [*colour, n, p]."""
+    c = table @ _lookup_factors(view, lobes)
+    if not lobes.isotropic:
+        return c
+    # the table holds the slice of azimuth 0; turned by phi, m mixes with -m
+    degree = _checks.degree_of(table.shape[-2])
+    m, l = _tables.orders(degree), _tables.bands(degree)
+    cos, sin = _views.azimuth_factors(view, degree + 1)
+    sin = sin[np.abs(m)] * jnp.asarray(-np.sign(m)[:, None], c.dtype)
+    cos, sin = (jnp.broadcast_to(f, c.shape) for f in (cos[np.abs(m)], sin))
+    return cos * c + sin * c[..., l * l + l - m, :]
+
+
+def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:
+    """`slice_values` in the order of `harmonics._pairing`, m >= 0 and m < 0 apart: two arrays [rows, colours, p]."""
+    table = lookup_table(lobes, degree)
+    table = jnp.pad(table.reshape(-1, *table.shape[-2:]), ((0, 0), (0, 1), (0, 0)))
+    *signs, k = rows(degree)
+    plus, minus = (jnp.swapaxes(table[:, index], 0, 1) for index in signs)
+    spread = jnp.asarray(k[:, None] == np.arange(max(degree, 1) + 1), table.dtype)
+
+    def look_up(view: Float[Array, "p 3"]) -> tuple[Array, Array]:
+        factors = _lookup_factors(view, lobes)
+        x = jnp.tensordot(plus, factors, 1)
+        if not lobes.isotropic:
+            return x, jnp.tensordot(minus, factors, 1)
+        # a product with a 0-1 matrix, whose transpose is one too: that of an indexed copy would be slow
+        cos, sin = ((spread @ f)[:, None] for f in _views.azimuth_factors(view, max(degree, 1) + 1))
+        return cos * x, sin * x
+
+    return look_up
+
+
+def _lookup_factors(view: Float[Array, "p 3"], lobes: Lobes) -> Float[Array, "columns p"]:
+    """What the columns of `lookup_table` are multiplied by."""
     if lobes.isotropic:
-        # the table holds the slice of azimuth 0; turned by phi, m mixes with -m
-        degree = _checks.degree_of(table.shape[-2])
-        m, l = _tables.orders(degree), _tables.bands(degree)
-        c = table @ _views.spline_weights(view, table.shape[-1] - 4)
-        cos, sin = _views.azimuth_factors(view, degree + 1)
-        sin = sin[np.abs(m)] * jnp.asarray(-np.sign(m)[:, None], c.dtype)
-        cos, sin = (jnp.broadcast_to(f, c.shape) for f in (cos[np.abs(m)], sin))
-        return cos * c + sin * c[..., l * l + l - m, :]
-    azimuths = lobes.weights.shape[-3]
-    orders = azimuths // 2 + 1
+        return _views.spline_weights(view, lobes.weights.shape[-3])
     spline = _views.spline_weights(view, lobes.weights.shape[-4])
-    waves = jnp.stack(_views.azimuth_factors(view, orders))  # [2, k, p]
-    factors = (waves[:, :, None] * spline[None, None]).reshape(-1, view.shape[0])
-    return table @ factors
+    waves = jnp.stack(_views.azimuth_factors(view, lobes.weights.shape[-3] // 2 + 1))  # [2, k, p]
+    return (waves[:, :, None] * spline[None, None]).reshape(-1, view.shape[0])
 
 
 def tabulate_brdf(

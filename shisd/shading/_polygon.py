@@ -30,7 +30,7 @@ from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models._light import lobe_product
-from shisd.shading._lobes import Lobes, lookup_table
+from shisd.shading._lobes import Lobes, lookup_table, slice_values
 from shisd.shading._surface import in_tiles, shade_tiles, surface
 
 Light = PolygonLight | PortalLight
@@ -144,8 +144,9 @@ def _shade(
     products = [_product(light, degree) for light in lights]
 
     def radiance(
-        frame: Float[Array, "p 3 3"], slices: Float[Array, "*s n p"], positions: Float[Array, "p 3"]
+        frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
     ) -> Float[Array, "*colour p"]:
+        slices = slice_values(table, local, lobes)
         total = jnp.zeros((*colour, positions.shape[0]), table.dtype)
         for light, product in zip(lights, products, strict=True):
             v, sign = _outline(light, positions, frame)
@@ -163,7 +164,7 @@ def _shade(
         return total
 
     size = _TILE if all(product is None for product in products) else _SMALL_TILE
-    return shade_tiles(lobes, table, points, colour, size, radiance)
+    return shade_tiles(lobes, points, colour, size, radiance)
 
 
 @eqx.filter_jit

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike, DTypeLike
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float
-from shisd.shading._lobes import Lobes, slice_values
+from shisd.shading._lobes import Lobes
 
 Shape = tuple[int, ...]
 _DIRECTIONS = ("normals", "views", "tangents")
@@ -47,16 +47,15 @@ def surface(
 
 def shade_tiles(
     lobes: Lobes,
-    table: Array,
     points: dict[str, Float[Array, "p 3"]],
     colour: Shape,
     size: int,
     radiance: Callable[..., Float[Array, "*colour p"]],
 ) -> Float[Array, " p *colour"]:
-    """`radiance(frame, slices, **others)` of all points, `size` at a time; 0 where the view is below the horizon.
+    """`radiance(frame, local, **others)` of all points, `size` at a time; 0 where the view is below the horizon.
 
-    `frame` [p, 3, 3] is local to world, `slices` [*colour, n, p] are the material's coefficients in it, and `others`
-    the `points` of the tile that are not directions.
+    `frame` [p, 3, 3] is local to world, `local` [p, 3] is the view in it, and `others` are the `points` of the tile
+    that are not directions.
     """
 
     def shade_tile(tile: dict[str, Array]) -> Float[Array, " p *colour"]:
@@ -65,7 +64,7 @@ def shade_tiles(
         normal = directions["normals"]
         r = frame(normal) if lobes.isotropic else tangent_frame(normal, directions["tangents"])
         local = jnp.einsum("pij,pi->pj", r, directions["views"])
-        values = radiance(r, slice_values(table, local, lobes), **others)
+        values = radiance(r, local, **others)
         return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(values, -1, 0))
 
     return in_tiles(shade_tile, points, size)

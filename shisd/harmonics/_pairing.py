@@ -1,0 +1,227 @@
+"""Integrals of products of two expansions, one of them turned by many rotations: sum over n of s_n (R c)_n.
+
+With R = Z(a) Y(b) Z(g) and Y(b) = J Z(-b) J as in `_rotation`, this is (Z(b) J Z(-a) s) . (J Z(g) c). The right side
+is a trigonometric polynomial in g, the same for all rotations: nothing of the size of c is turned for each of them, and
+all colours of c cost one product with a constant matrix. J exchanges y and z, and so the parities in y and in z: three
+quarters of it are zeros. Coefficients of one parity and a few degrees stand together, apart for m >= 0 and m < 0: turns
+about z then multiply whole blocks, and J is a few small dense products.
+
+notation: k = |m|; A = orders with l + k even, B = odd; x = coefficients of m >= 0, y = of m < 0, [rows, colours, p];
+[degrees, orders, colours, p] in a block.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+
+from shisd._typing import Array, Float
+from shisd.harmonics import _tables
+from shisd.harmonics._rotation import turns
+
+_DEGREES_TOGETHER = 4  # more make fewer and larger products, with more zeros in them
+_QUARTER = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # turn about x
+
+Parts = tuple[Array, Array, Array, Array]  # xa, ya, xb, yb
+Waves = list[Array]  # cosines and sines [L+1, p] of the multiples of an angle
+
+
+class _Block(NamedTuple):
+    """A few degrees of one parity. `a`, `b`: their orders. Matrices [degrees, to, from] between classes of orders."""
+
+    a: np.ndarray
+    b: np.ndarray
+    plus: np.ndarray  # where the coefficients are, A then B; (L+1)^2 where there is none
+    minus: np.ndarray
+    swap: tuple[np.ndarray, ...]  # J: xa from xa, ya from xb, xb from ya, yb from yb
+    about_x: tuple[np.ndarray, ...]  # rates of rotation: xa from yb, ya from xb, xb from ya, yb from xa
+    about_y: tuple[np.ndarray, ...]  # xa from xb, ya from yb, xb from xa, yb from ya
+
+
+@functools.cache
+def _blocks(degree: int) -> tuple[_Block, ...]:
+    none = (degree + 1) ** 2
+    blocks = []
+    for parity in range(min(2, degree + 1)):
+        of_parity = np.arange(parity, degree + 1, 2)
+        for last in range(len(of_parity), 0, -_DEGREES_TOGETHER):
+            degrees = of_parity[max(0, last - _DEGREES_TOGETHER) : last]
+            l = degrees[:, None]
+            a, b = (np.arange(first, max(first, degrees[-1]) + 1, 2) for first in (parity, 1 - parity))
+            xa, xb = (np.where(k <= l, l * l + l + k, none) for k in (a, b))
+            ya, yb = (np.where((k <= l) & (k > 0), l * l + l - k, none) for k in (a, b))
+            part = functools.partial(_part, degrees, none)
+            exchange, about_x, about_y = (
+                [matrices[d] for d in degrees] for matrices in (_tables.swap_matrices(degree), *_rates(degree))
+            )
+            blocks.append(_Block(
+                a, b, np.concatenate([xa.ravel(), xb.ravel()]), np.concatenate([ya.ravel(), yb.ravel()]),
+                (part(exchange, xa, xa), part(exchange, ya, xb), part(exchange, xb, ya), part(exchange, yb, yb)),
+                (part(about_x, xa, yb), part(about_x, ya, xb), part(about_x, xb, ya), part(about_x, yb, xa)),
+                (part(about_y, xa, xb), part(about_y, ya, yb), part(about_y, xb, xa), part(about_y, yb, ya)),
+            ))  # fmt: skip
+    return tuple(blocks)
+
+
+def _part(degrees: np.ndarray, none: int, matrices: list[np.ndarray], to: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Rows `to` and columns `source` of one matrix for each degree; zero where there is no coefficient."""
+    cut = lambda l, index: np.where(index < none, index - l * l, 2 * l + 1)
+    return np.stack([
+        np.pad(j, (0, 1))[np.ix_(cut(l, t), cut(l, s))]
+        for l, j, t, s in zip(degrees, matrices, to, source, strict=True)
+    ])  # fmt: skip
+
+
+def _rates(degree: int) -> list[list[np.ndarray]]:
+    """For x and y, the generator of every band as a matrix."""
+    matrices = []
+    for terms in _tables.generator_gather(degree)[:2]:
+        bands = [np.zeros((2 * l + 1, 2 * l + 1)) for l in range(degree + 1)]
+        for index, factor in terms:
+            for n in np.flatnonzero(factor):
+                l = int(np.sqrt(n))
+                bands[l][n - l * l, index[n] - l * l] += factor[n]
+        matrices.append(bands)
+    return matrices
+
+
+def rows(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coefficients of m >= 0 and of m < 0, and |m|, in the order of `pair_many`; (L+1)^2 where there is none."""
+    blocks = _blocks(degree)
+    k = [np.broadcast_to(k, (len(b.swap[0]), len(k))).ravel() for b in blocks for k in (b.a, b.b)]
+    plus, minus = (np.concatenate([getattr(b, name) for b in blocks]).astype(np.int32) for name in ("plus", "minus"))
+    return plus, minus, np.concatenate(k).astype(np.int32)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
+def pair_many(
+    x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], c: Float[Array, "f2 n"], r: Float[Array, "p 3 3"],
+    degree: int, upright: bool = False,
+) -> Float[Array, "f3 p"]:  # fmt: skip
+    """sum over n of s_n (R c)_n, for an s of every rotation, ordered as `rows` says, and a c that all share.
+
+    Of the numbers of colours f and f2 one may be 1. `upright` promises that R z has y = 0 <= x.
+    Derivatives: exact wherever the pole stays in place, to every order.
+    """
+    a, b, g = turns(r, max(degree, 1))
+    return _pair(_split(x, y, degree), c, None if upright else a, b, g, degree)
+
+
+def _pair_many_jvp(degree, upright, primals, tangents):
+    (x, y, c, r), (dx, dy, dc, dr) = primals, tangents
+    value = pair_many(x, y, c, r, degree, upright)
+    change = jnp.zeros_like(value)
+    zero = lambda t, like: jnp.zeros_like(like) if isinstance(t, SymbolicZero) else t
+    if not all(isinstance(t, SymbolicZero) for t in (dx, dy, dr)):
+        lobe = _split(zero(dx, x), zero(dy, y), degree)
+        if not isinstance(
+            dr, SymbolicZero
+        ):  # d(s . R c) = s . G R c = (-G s) . R c with the rate G, as in `rotate_many`
+            rate = jnp.einsum("pij,pkj->pik", dr, r)
+            rates = (rate[:, 1, 2] - rate[:, 2, 1], rate[:, 2, 0] - rate[:, 0, 2], rate[:, 0, 1] - rate[:, 1, 0])
+            turning = _turning(_split(x, y, degree), [w / 2 for w in rates], degree)
+            lobe = [tuple(p + q for p, q in zip(s, t, strict=True)) for s, t in zip(lobe, turning, strict=True)]
+        change += _pair_away_from_pole(lobe, c, r, degree)
+    if not isinstance(dc, SymbolicZero):
+        change += _pair_away_from_pole(_split(x, y, degree), dc, r, degree)
+    return value, change
+
+
+pair_many.defjvp(_pair_many_jvp, symbolic_zeros=True)
+
+
+def _pair_away_from_pole(s: list[Parts], c: Array, r: Float[Array, "p 3 3"], degree: int) -> Array:
+    """`pair_many` with smooth angles: where R nearly keeps the z axis, s . R c = Q s . Q R c with Q, a quarter turn."""
+    near = r[:, 2, 2] ** 2 > 0.5
+    a, b, g = turns(jnp.where(near[:, None, None], jnp.asarray(_QUARTER, r.dtype) @ r, r), max(degree, 1))
+    here = near[None, None, None]
+    turned = [(xa, -ya, xb, -yb) for xa, ya, xb, yb in _swapped(s, degree)]
+    s = [tuple(jnp.where(here, q, p) for p, q in zip(*both, strict=True)) for both in zip(s, turned, strict=True)]
+    return _pair(s, c, a, b, g, degree)
+
+
+def _pair(s: list[Parts], c: Array, a: Waves | None, b: Waves, g: Waves, degree: int) -> Float[Array, "f3 p"]:
+    """(Z(b) J Z(-a) s) . (J Z(g) c)."""
+    if a is not None:
+        s = _turned(s, a[0], -a[1], degree)
+    s = _turned(_swapped(s, degree), *b, degree)
+    series = jnp.pad(_series(c, degree), ((0, 1), (0, 0), (0, 0)))
+    colours = range(s[0][0].shape[2])
+    total = 0.0
+    for k in range(min(2, degree + 1)):  # even multiples of g meet x of even and y of odd degrees; and conversely
+        kept, index = [], []
+        for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True):
+            same = block.a[0] == k
+            kept += (xa, xb) if same else (ya, yb)
+            index.append(block.plus if same else block.minus)
+        factors = series[np.concatenate(index)]
+        factors = jnp.concatenate([factors[..., k : degree + 1 : 2], factors[..., degree + 1 + k :: 2]], axis=-1)
+        waves = jnp.concatenate([g[0][k::2], g[1][k::2]])
+        rows = [jnp.concatenate([z[:, :, i].reshape(-1, z.shape[-1]) for z in kept]) for i in colours]
+        if len(rows) == 1:
+            sums = jnp.einsum("nfk,np->fkp", factors, rows[0])
+        else:
+            sums = jnp.stack([factors[:, min(i, factors.shape[1] - 1)].T @ rows[i] for i in colours])
+        total += jnp.sum(sums * waves[None], axis=1)
+    return total
+
+
+def _series(c: Float[Array, "f n"], degree: int) -> Float[Array, "n f k"]:
+    """J Z(g) c as factors of cos(k g), then of sin(k g)."""
+    cosine, sine = [], []
+    for l, j in enumerate(_tables.swap_matrices(degree)):
+        plus, minus = c[None, :, l * l + l : (l + 1) ** 2], c[None, :, l * l : l * l + l + 1][..., ::-1]
+        j_plus = jnp.asarray(j[:, None, l:], c.dtype)
+        j_minus = jnp.asarray(j[:, None, l::-1] * (np.arange(l + 1) > 0), c.dtype)  # m = 0 counts once
+        pad = ((0, 0), (0, 0), (0, degree - l))
+        cosine.append(jnp.pad(j_plus * plus + j_minus * minus, pad))
+        sine.append(jnp.pad(j_minus * plus - j_plus * minus, pad))
+    return jnp.concatenate([jnp.concatenate(cosine), jnp.concatenate(sine)], axis=-1)
+
+
+# ---- block by block
+
+
+def _split(x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], degree: int) -> list[Parts]:
+    parts, used = [], 0
+    for block in _blocks(degree):
+        shapes = [(len(block.swap[0]), len(k), *x.shape[1:]) for k in (block.a, block.b)]
+        middle, end = used + shapes[0][0] * shapes[0][1], used + len(block.plus)
+        xa, ya = (z[used:middle].reshape(shapes[0]) for z in (x, y))
+        xb, yb = (z[middle:end].reshape(shapes[1]) for z in (x, y))
+        parts.append((xa, ya, xb, yb))
+        used = end
+    return parts
+
+
+def _swapped(s: list[Parts], degree: int) -> list[Parts]:
+    """J s."""
+    return [_product(block.swap, (xa, xb, ya, yb)) for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True)]
+
+
+def _turning(s: list[Parts], rates: list[Array], degree: int) -> list[Parts]:
+    """G s of rotation with `rates` [p] about x, y and z."""
+    changes = []
+    for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True):
+        wx, wy, wz = (w[None, None, None] for w in rates)
+        a, b = (jnp.asarray(k[None, :, None, None], xa.dtype) for k in (block.a, block.b))
+        about_x, about_y = _product(block.about_x, (yb, xb, ya, xa)), _product(block.about_y, (xb, yb, xa, ya))
+        about_z = (-a * ya, a * xa, -b * yb, b * xb)
+        changes.append(tuple(wx * p + wy * q + wz * r for p, q, r in zip(about_x, about_y, about_z, strict=True)))
+    return changes
+
+
+def _turned(s: list[Parts], cos: Array, sin: Array, degree: int) -> list[Parts]:
+    """Z s for the turn whose multiples have these cosines and sines [L+1, p]."""
+    turned = []
+    for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True):
+        (ca, sa), (cb, sb) = ([w[k[0] :: 2][: len(k)][None, :, None] for w in (cos, sin)] for k in (block.a, block.b))
+        turned.append((ca * xa - sa * ya, ca * ya + sa * xa, cb * xb - sb * yb, cb * yb + sb * xb))
+    return turned
+
+
+def _product(matrices: tuple[np.ndarray, ...], parts: Parts) -> Parts:
+    return tuple(jnp.einsum("lij,ljfp->lifp", jnp.asarray(m, x.dtype), x) for m, x in zip(matrices, parts, strict=True))  # type: ignore[return-value]

@@ -1,0 +1,114 @@
+"""Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--output DIR] [--readme].
+
+Writes DIR/report.json with every row, DIR/report.md with tables, and a figure for each group of tasks; --readme also
+puts tables and figures into the README. `make report` sets the allocator as `make bench` does.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from tests.bench import environments, harness, local_lights, planning, renderers, spherical, stability
+from tests.bench.run import paste, table
+
+GROUPS = {  # name: (title, tasks)
+    "environments": ("A sphere under a map", environments.tasks),
+    "local_lights": ("Polygon lights, windows and projected lights", local_lights.tasks),
+    "spherical": ("Spherical harmonics", spherical.tasks),
+    "renderers": ("Whole pictures", renderers.tasks),
+}
+TABLES = {"planning": planning.tables, "stability": stability.tables}
+
+
+def summary(panels: dict[str, list[dict]], item: str) -> list[dict]:
+    """A row for every method: medians of its times over the tasks, then its error in each."""
+    methods = dict.fromkeys((r["family"], r["setting"]) for rows in panels.values() for r in rows)
+    lines = []
+    for family, setting in methods:
+        own = {
+            title: r for title, rows in panels.items() for r in rows if (r["family"], r["setting"]) == (family, setting)
+        }
+        middle = lambda key, own=own: (
+            float(np.median(x)) if (x := [r[key] for r in own.values() if r[key] is not None]) else None
+        )
+        lines.append({
+            "method": f"{family}, {setting}",
+            f"us/{item}": middle(f"us/{item}"),
+            "with gradient": middle("with gradient"),
+            "first call s": middle("first call s"),
+            "setup s": middle("setup s"),
+            "MB": middle("MB"),
+            **{title: own[title]["relative RMSE"] if title in own else None for title in panels},
+        })  # fmt: skip
+    return lines
+
+
+def leads(panels: dict[str, list[dict]], item: str) -> list[dict]:
+    """For every task and family, the least ratio of its time to ours at its error, below 10 %; below 1 it is ahead."""
+    lines = []
+    for title, rows in panels.items():
+        line = {"task": title}
+        for row in harness.lead(rows, item):
+            ratio = row["time / ours, least"]
+            line[row["family"]] = "-" if ratio is None else f"{ratio:.2g} at {row['its error']:.1g}"
+        lines.append(line)
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", type=Path, default=Path("output/report"))
+    parser.add_argument("--quick", action="store_true", help="few tasks and settings: a check, in two minutes")
+    parser.add_argument("--only", choices=[*GROUPS, *TABLES], action="append")
+    parser.add_argument("--readme", action="store_true", help="put tables into README.md and figures into examples/")
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    wanted = arguments.only or [*GROUPS, *TABLES]
+    allocator = "tuned" if os.environ.get("MALLOC_MMAP_MAX_") == "0" else "default"
+    note = f"{os.cpu_count()} cores ({platform.machine()}), jax {jax.__version__}, default XLA flags, {allocator} allocator."
+    results, sections, start = {"machine": note, "rows": []}, {}, time.perf_counter()
+
+    def keep(name: str, text: str) -> None:
+        sections[name] = text
+        print(f"{text}\n\n[{time.perf_counter() - start:.0f} s]\n", flush=True)
+
+    for name, (title, make) in GROUPS.items():
+        if name not in wanted:
+            continue
+        panels: dict[str, dict[str, list[dict]]] = {}
+        for task in make(arguments.quick):
+            rows = harness.run(task, seconds=0.05 if arguments.quick else 0.25)
+            panels.setdefault(task.item, {})[task.title] = rows
+            results["rows"] += rows
+            print(f"{task.title}: {len(rows)} methods, {time.perf_counter() - start:.0f} s", flush=True)
+        parts = [f"{title}: relative RMSE of every method, and what it costs. {note}"]
+        for item, of_item in panels.items():
+            file = f"{name}.png" if len(panels) == 1 else f"{name}_{item}.png"
+            folders = [arguments.output, *([Path("examples")] if arguments.readme else [])]
+            for folder in folders:
+                harness.draw(of_item, item, folder / file)
+            parts.append(f"![Error against time: {title}, by {item}](examples/{file})")
+            parts.append(table(summary(of_item, item)))
+            parts.append("Time over ours at equal error, where that is least (settings with errors below 10 %):")
+            parts.append(table(leads(of_item, item)))
+        keep(name, "\n\n".join(parts))
+    for name, make in TABLES.items():
+        if name in wanted:
+            made = make(arguments.quick)
+            results[name] = made
+            keep(name, "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in made.items()) + f"\n\n{note}")
+    (arguments.output / "report.json").write_text(json.dumps(results, indent=1))
+    (arguments.output / "report.md").write_text("\n\n".join(sections.values()) + "\n")
+    for name, text in sections.items() if arguments.readme else ():
+        paste(name, text)
+    print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Filtered maps against the integrals that they stand for, in values, predicted errors and derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from shisd import decomposition, models, shading
+
+DEGREE = 6
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def directions(rng, count):
+    """Normals all around, and views as a sphere's picture has them, by the square of the sine of their elevation."""
+    normals = unit(rng.normal(size=(count, 3)))
+    side = unit(np.cross(normals, rng.normal(size=(count, 3))))
+    sine = np.sqrt(rng.uniform(size=(count, 1)))
+    return normals, sine * side + np.sqrt(1 - sine**2) * normals
+
+
+def light(rng):
+    return rng.normal(size=(3, (DEGREE + 1) ** 2)) / (
+        1 + np.repeat(np.arange(DEGREE + 1), 2 * np.arange(DEGREE + 1) + 1)
+    )
+
+
+MATERIALS = {
+    "diffuse": lambda: models.Lambertian(0.7),
+    "glossy": lambda: models.Ggx(0.4, np.array([0.9, 0.6, 0.3])),
+}
+
+
+@functools.cache
+def lobes_of(material, dtype):
+    axes = decomposition.fibonacci_directions(2 * DEGREE + 1, dtype=dtype)
+    return shading.tabulate_brdf(MATERIALS[material](), decomposition.RotatedZonalBasis(axes, DEGREE), views=32)
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_error_is_as_predicted(material, dtype, rng):
+    lobes, e = lobes_of(material, dtype), light(rng).astype(dtype)
+    n, v = (x.astype(dtype) for x in directions(rng, 4000))
+    truth = np.asarray(shading.shade_environment(lobes, e, n, v))
+    for tolerance in (0.1, 0.01, 1e-6):
+        filtered = shading.prefilter(lobes, e, tolerance=tolerance)
+        got = shading.shade_prefiltered(filtered, n, v)
+        assert got.dtype == dtype and got.shape == (4000, 3)
+        error = np.sqrt(np.mean((np.asarray(got) - truth) ** 2) / np.mean(truth**2))
+        predicted = float(filtered.error)
+        assert predicted <= tolerance
+        assert predicted / 2 - 5e-4 < error < 2 * predicted + 5e-4  # 5e-4: the splines, with all channels
+    if material == "diffuse":  # view-independent and zonal about the normal
+        assert int(shading.prefilter(lobes, e, tolerance=1e-4).channels) == 1 and not bool(filtered.mirror)
+
+
+def test_derivatives_where_frames_turn(x64, rng):
+    filtered = shading.prefilter(lobes_of("glossy", np.dtype("float64")), light(rng), tolerance=1e-2)
+    axis = np.concatenate([np.eye(3), -np.eye(3), unit(rng.normal(size=(3, 3)))])
+    tilted = unit(axis + 0.4 * unit(rng.normal(size=axis.shape)))
+    for n, v in ((axis, tilted), (tilted, axis), (axis, axis), (unit(axis + tilted), tilted)):  # last: mirrored to axes
+        check_grads(lambda n, v: shading.shade_prefiltered(filtered, n, v), (n, v), 1, ["fwd", "rev"], 1e-4, 1e-4, 1e-6)
+
+
+def test_tables_are_linear_in_light_and_material_under_jit(x64, rng):
+    lobes, e = lobes_of("glossy", np.dtype("float64")), jnp.asarray(light(rng))
+    first = shading.prefilter(lobes, e, tolerance=1e-3)
+    n, v = directions(rng, 50)
+
+    @jax.jit
+    def radiance(gain, scale):
+        bright = jax.tree.map(lambda x: x, lobes)
+        bright = type(lobes)(lobes.basis, lobes.weights * gain, lobes.quadrature_error, lobes.isotropic, lobes.domain)
+        return shading.shade_prefiltered(shading.prefilter(bright, e * scale, like=first), n, v)
+
+    np.testing.assert_allclose(radiance(2.0, 3.0), 6 * shading.shade_prefiltered(first, n, v), rtol=1e-9, atol=1e-9)
+    slope = jax.jacrev(radiance, (0, 1))(1.0, 1.0)
+    for got in slope:
+        np.testing.assert_allclose(got, shading.shade_prefiltered(first, n, v), rtol=1e-9, atol=1e-9)
+
+
+def test_no_light_and_views_below(rng):
+    lobes = lobes_of("glossy", np.dtype("float32"))
+    n, v = (x.astype(np.float32) for x in directions(rng, 5))
+    dark = shading.prefilter(lobes, np.zeros((3, (DEGREE + 1) ** 2), np.float32))
+    assert np.all(np.asarray(shading.shade_prefiltered(dark, n, v)) == 0) and float(dark.error) == 0
+    lit = shading.prefilter(lobes, light(rng).astype(np.float32))
+    assert np.all(np.asarray(shading.shade_prefiltered(lit, n, -v)) == 0)
+    assert np.all(np.isnan(shading.shade_prefiltered(lit, np.zeros_like(n), v)))
+
+
+def test_what_cannot_be_filtered_is_refused(rng):
+    lobes, e = lobes_of("glossy", np.dtype("float32")), light(rng).astype(np.float32)
+    with pytest.raises(ValueError, match="tolerance"):
+        shading.prefilter(lobes, e, tolerance=0.0)
+    with pytest.raises(ValueError, match="pass that as `like`"):
+        jax.jit(lambda e: shading.prefilter(lobes, e).maps)(e)
+    with pytest.raises(ValueError, match="`light_coefficients`"):
+        shading.prefilter(lobes, e[:, :5])
+    other = shading.prefilter(lobes, e[:, :9])
+    with pytest.raises(ValueError, match="at degree 6"):
+        shading.prefilter(lobes, e, like=other)
+    with pytest.raises(ValueError, match="shading.prefilter"):
+        shading.shade_prefiltered(lobes, e, e)
+    with pytest.raises(ValueError, match="do not broadcast"):
+        shading.shade_prefiltered(other, np.ones((4, 3), np.float32), np.ones((5, 3), np.float32))
