@@ -68,6 +68,21 @@ def test_area_lights_writes_pictures_and_a_table(tmp_path):
     assert refused.returncode != 0 and "exists" in refused.stderr
 
 
+@pytest.mark.slow
+def test_many_devices_agree_with_one(tmp_path):
+    """Simulated devices, and two processes that are started by the example."""
+    output = tmp_path / "many_devices"
+    command = [ROOT / "examples/many_devices.py", "--output", output]
+    done = python(*command, "--degree", 4, "--pixels", 512, "--devices", 2)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (output / "many_devices.md").read_text() in done.stdout and "agree with one device" in done.stdout
+    assert "2 processes" in done.stdout and "2 simulated devices" in done.stdout
+    refused = python(*command)
+    assert refused.returncode != 0 and "exists" in refused.stderr
+    refused = python(*command[:1], "--devices", 2, 3)
+    assert refused.returncode != 0 and "divisible" in refused.stderr
+
+
 def fitted(output):
     with next(output.glob("*.csv")).open() as file:
         return {row["parameter"]: row for row in csv.DictReader(file)}

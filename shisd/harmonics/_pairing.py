@@ -25,7 +25,7 @@ from shisd.harmonics._rotation import turns
 _DEGREES_TOGETHER = 4  # more make fewer and larger products, with more zeros in them
 _QUARTER = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # turn about x
 
-Parts = tuple[Array, Array, Array, Array]  # xa, ya, xb, yb
+Parts = tuple[Array, ...]  # xa, ya, xb, yb
 Waves = list[Array]  # cosines and sines [L+1, p] of the multiples of an angle
 
 
@@ -147,10 +147,10 @@ def _pair(s: list[Parts], c: Array, a: Waves | None, b: Waves, g: Waves, degree:
     """(Z(b) J Z(-a) s) . (J Z(g) c)."""
     if a is not None:
         s = _turned(s, a[0], -a[1], degree)
-    s = _turned(_swapped(s, degree), *b, degree)
+    s = _turned(_swapped(s, degree), b[0], b[1], degree)
     series = jnp.pad(_series(c, degree), ((0, 1), (0, 0), (0, 0)))
     colours = range(s[0][0].shape[2])
-    total = 0.0
+    totals = []
     for k in range(min(2, degree + 1)):  # even multiples of g meet x of even and y of odd degrees; and conversely
         kept, index = [], []
         for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True):
@@ -165,8 +165,8 @@ def _pair(s: list[Parts], c: Array, a: Waves | None, b: Waves, g: Waves, degree:
             sums = jnp.einsum("nfk,np->fkp", factors, rows[0])
         else:
             sums = jnp.stack([factors[:, min(i, factors.shape[1] - 1)].T @ rows[i] for i in colours])
-        total += jnp.sum(sums * waves[None], axis=1)
-    return total
+        totals.append(jnp.sum(sums * waves[None], axis=1))
+    return functools.reduce(jnp.add, totals)
 
 
 def _series(c: Float[Array, "f n"], degree: int) -> Float[Array, "n f k"]:
@@ -224,4 +224,4 @@ def _turned(s: list[Parts], cos: Array, sin: Array, degree: int) -> list[Parts]:
 
 
 def _product(matrices: tuple[np.ndarray, ...], parts: Parts) -> Parts:
-    return tuple(jnp.einsum("lij,ljfp->lifp", jnp.asarray(m, x.dtype), x) for m, x in zip(matrices, parts, strict=True))  # type: ignore[return-value]
+    return tuple(jnp.einsum("lij,ljfp->lifp", jnp.asarray(m, x.dtype), x) for m, x in zip(matrices, parts, strict=True))

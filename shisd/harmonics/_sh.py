@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import angle_multiples, normalize
+from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import _tables
 
@@ -38,7 +39,7 @@ def sh_basis(directions: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
     Source: ISD15 Eq. 7, ISD15s Eq. 3-5.
     """
     degree = _checks.degree(degree)
-    return _jitted_basis(_checks.vectors("directions", directions), degree)
+    return by_device(_jitted_basis, {"directions": _checks.vectors("directions", directions)}, degree)
 
 
 def evaluate(coefficients: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
@@ -65,18 +66,19 @@ def evaluate(coefficients: ArrayLike, directions: ArrayLike) -> Float[Array, "*b
         ) from error
     rank = max(c.ndim, d.ndim)
     c, d = (a.reshape((1,) * (rank - a.ndim) + a.shape) for a in (c, d))
-    return _evaluate(c, d, degree)
+    return by_device(_evaluate, {"coefficients": c, "directions": d}, degree)
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _jitted_basis(directions: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]:
-    return _basis(normalize(directions), degree)
+def _jitted_basis(batch: dict[str, Float[Array, "*batch 3"]], degree: int) -> Float[Array, "*batch n"]:
+    return _basis(normalize(batch["directions"]), degree)
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _evaluate(c: Float[Array, "*c n"], directions: Float[Array, "*d 3"], degree: int) -> Float[Array, "*batch"]:
-    """`c` and `directions` of equal rank, their batch axes broadcast."""
-    u, rank = normalize(directions), c.ndim - 1
+@functools.partial(jax.jit, static_argnums=1)
+def _evaluate(batch: dict[str, Array], degree: int) -> Float[Array, "*batch"]:
+    """`coefficients` and `directions` of equal rank, their batch axes broadcast."""
+    c, u = batch["coefficients"], normalize(batch["directions"])
+    rank = c.ndim - 1
     if any(i > 1 and j > 1 for i, j in zip(c.shape[:-1], u.shape[:-1], strict=True)):
         return jnp.sum(c * _basis(u, degree), axis=-1)
     values = _expand(c.reshape(-1, c.shape[-1]), u.reshape(-1, 3), degree)

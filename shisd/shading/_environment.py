@@ -15,10 +15,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics._pairing import pair_many
 from shisd.shading._lobes import Lobes, slice_orders
-from shisd.shading._surface import shade_tiles, surface
+from shisd.shading._surface import shade_points, shade_tiles, surface
 
 _NUMBERS_AT_ONCE = 1 << 18  # coefficients of slices held at a time: what one tile of pixels needs stays in cache
 
@@ -53,15 +54,15 @@ def shade_environment(
     if e.ndim > 2:
         raise ValueError(f"`light_coefficients` must have shape [n] or [colour, n]; got {list(e.shape)}.")
     light = [("light_coefficients", e.shape[:-1])]
-    lobes, points, shape, colour = surface(lobes, tangents, light, [e.dtype], normals=normals, views=views)
+    lobes, points, colour = surface(lobes, tangents, light, [e.dtype], normals=normals, views=views)
     degree = min(light_degree, lobes.degree)
-    radiance = _shade(lobes, e[..., : (degree + 1) ** 2].astype(lobes.weights.dtype), points, colour)
-    return radiance.reshape(*shape, *colour)
+    e = e[..., : (degree + 1) ** 2].astype(lobes.weights.dtype)
+    return by_device(shade_points, points, _shade, lobes, e, colour)
 
 
 @eqx.filter_jit
 def _shade(
-    lobes: Lobes, e: Float[Array, "*c n"], points: dict[str, Float[Array, "p 3"]], colour: tuple[int, ...]
+    points: dict[str, Float[Array, "p 3"]], lobes: Lobes, e: Float[Array, "*c n"], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     degree = _checks.degree_of(e.shape[-1])
     look_up = slice_orders(lobes, degree)

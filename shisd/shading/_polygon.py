@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import times
+from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.domains import HaarBasis, _moments
 from shisd.domains._haar import clip_to_cells
@@ -31,7 +32,7 @@ from shisd.harmonics._rotation import rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models._light import lobe_product
 from shisd.shading._lobes import Lobes, lookup_table, slice_values
-from shisd.shading._surface import in_tiles, shade_tiles, surface
+from shisd.shading._surface import in_tiles, shade_points, shade_tiles, surface
 
 Light = PolygonLight | PortalLight
 _TILE = 1024  # pixels at a time
@@ -104,8 +105,7 @@ def project_light(light: Light, positions: ArrayLike, basis: int | HaarBasis) ->
     p = _checks.vectors("positions", positions)
     dtype = jnp.promote_types(p.dtype, light.points.dtype)
     light = jax.tree.map(lambda x: x.astype(dtype), light)
-    values = _project(light, p.astype(dtype).reshape(-1, 3), basis)
-    return values.reshape(*p.shape[:-1], *values.shape[1:])
+    return by_device(shade_points, {"positions": p.astype(dtype)}, _project, light, basis)
 
 
 def _shade_lights(
@@ -130,14 +130,14 @@ def _shade_lights(
             )
     colours = [(f"{name} {i}", x.colour) for i, x in enumerate(lights)]
     vectors = {"positions": positions, "normals": normals, "views": views}
-    lobes, points, shape, colour = surface(lobes, tangents, colours, [x.points.dtype for x in lights], **vectors)
+    lobes, points, colour = surface(lobes, tangents, colours, [x.points.dtype for x in lights], **vectors)
     lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
-    return _shade(lobes, lights, points, colour).reshape(*shape, *colour)
+    return by_device(shade_points, points, _shade, lobes, lights, colour)
 
 
 @eqx.filter_jit
 def _shade(
-    lobes: Lobes, lights: tuple[Light, ...], points: dict[str, Float[Array, "p 3"]], colour: tuple[int, ...]
+    points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[Light, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     degree, table = lobes.degree, lookup_table(lobes)
     axes = jnp.asarray(zonal_inverse(degree, table.dtype)[0])
@@ -168,7 +168,9 @@ def _shade(
 
 
 @eqx.filter_jit
-def _project(light: Light, positions: Float[Array, "p 3"], basis: int | HaarBasis) -> Float[Array, " p *colour_n"]:
+def _project(
+    points: dict[str, Float[Array, "p 3"]], light: Light, basis: int | HaarBasis
+) -> Float[Array, " p *colour_n"]:
     incident = _incident(light)
     product = None if isinstance(basis, HaarBasis) else _product(light, basis)
 
@@ -189,7 +191,7 @@ def _project(light: Light, positions: Float[Array, "p 3"], basis: int | HaarBasi
         return jnp.moveaxis(times(c, sign), -1, 0)
 
     size = 1 + 2048 // basis.size if isinstance(basis, HaarBasis) else _SMALL_TILE
-    return in_tiles(project, {"positions": positions}, size)
+    return in_tiles(project, points, size)
 
 
 def _outline(light: Light, position: Float[Array, "p 3"], frame: Float[Array, "p 3 3"]) -> tuple[Loop, Array]:

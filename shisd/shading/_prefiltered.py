@@ -18,6 +18,8 @@ notation: s = the normal, or the direction mirrored at it; t = sin(theta_o) time
 the viewer's side (s = normal) or to the normal (s = mirror direction); psi = the angle from the frame's theta to t.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,12 +28,13 @@ from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize, safe_sqrt
+from shisd._sharding import by_device
 from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import _tables, rotate
 from shisd.harmonics._rotation import rotate_many
 from shisd.shading import _views
 from shisd.shading._lobes import Lobes
-from shisd.shading._surface import in_tiles
+from shisd.shading._surface import in_tiles, shade_points
 
 _TILE = 2048  # pixels at a time
 _ROWS_PER_BAND = 3  # texels from pole to pole for each band: cubic splines are then good to 1e-3 of the highest one
@@ -127,15 +130,15 @@ def shade_prefiltered(
     """
     if not isinstance(prefiltered, PrefilteredLobes):
         raise ValueError(f"`prefiltered` must come from shading.prefilter; got {type(prefiltered).__name__}.")
-    n, v = _checks.vectors("normals", normals), _checks.vectors("views", views)
+    points = {"normals": _checks.vectors("normals", normals), "views": _checks.vectors("views", views)}
     try:
-        shape = np.broadcast_shapes(n.shape, v.shape)
+        np.broadcast_shapes(*(x.shape for x in points.values()))
     except ValueError as error:
-        raise ValueError(f"`normals` {list(n.shape)} and `views` {list(v.shape)} do not broadcast.") from error
-    dtype = jnp.result_type(prefiltered.maps, n, v)
-    flat = {k: jnp.broadcast_to(x.astype(dtype), shape).reshape(-1, 3) for k, x in (("normals", n), ("views", v))}
-    radiance = _shade(_as_type(prefiltered, dtype), flat)
-    return radiance.reshape(*shape[:-1], *np.broadcast_shapes(*prefiltered.colours))
+        shapes = " and ".join(f"`{name}` {list(x.shape)}" for name, x in points.items())
+        raise ValueError(f"{shapes} do not broadcast.") from error
+    dtype = jnp.result_type(prefiltered.maps, *points.values())
+    points = {name: x.astype(dtype) for name, x in points.items()}
+    return by_device(shade_points, points, _shade, _as_type(prefiltered, dtype))
 
 
 def _as_type(prefiltered: PrefilteredLobes, dtype: jnp.dtype) -> PrefilteredLobes:
@@ -260,13 +263,13 @@ def _chart(e: Float[Array, "s n"], combine: Array, m: Array, degree: int) -> Flo
 
 
 @eqx.filter_jit
-def _shade(lobes: PrefilteredLobes, points: dict[str, Float[Array, "p 3"]]) -> Float[Array, "p colour"]:
+def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> Float[Array, " p *colour"]:
     channel, order = lobes.channel, lobes.order
     material, light = (int(np.prod(c)) for c in lobes.colours)
     rows, first, kept = _grid(lobes.degree)
     width = 2 * rows + 4
 
-    def shade(tile: dict[str, Array]) -> Float[Array, "p colour"]:
+    def shade(tile: dict[str, Array]) -> Float[Array, " p *colour"]:
         n, v = normalize(tile["normals"]), normalize(tile["views"])
         cosine = jnp.sum(n * v, axis=1)
         across = v - cosine[:, None] * n
@@ -296,7 +299,8 @@ def _shade(lobes: PrefilteredLobes, points: dict[str, Float[Array, "p 3"]]) -> F
         terms = waves[..., None] * a[:, channel] * looked.reshape(-1, len(order), light)
         sums = jnp.tile(jnp.eye(terms.shape[-1], dtype=a.dtype), (len(order), 1))  # a product: jnp.sum is slow here
         total = terms.reshape(-1, sums.shape[0]) @ sums
-        return jnp.where((cosine < 0)[:, None], 0, total)
+        total = jnp.where((cosine < 0)[:, None], 0, total)
+        return total.reshape(-1, *np.broadcast_shapes(*lobes.colours))
 
     return in_tiles(shade, points, _TILE)
 
@@ -312,4 +316,5 @@ def _cubic(x: Float[Array, " p"]) -> tuple[Array, list[Array]]:
 
 def _lookup(table: Float[Array, "rows n"], row: Array, taps: list[tuple[int, Array]]) -> Float[Array, "p n"]:
     """Weighted sums of rows: whole rows are fetched, which is one pass over contiguous numbers."""
-    return sum(w[:, None] * table.at[row + offset].get(mode="promise_in_bounds") for offset, w in taps)
+    fetch = lambda offset: table.at[row + offset].get(mode="promise_in_bounds")
+    return functools.reduce(jnp.add, [w[:, None] * fetch(offset) for offset, w in taps])

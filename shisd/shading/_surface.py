@@ -1,6 +1,7 @@
 """Surface points, as every shading verb takes them: their checks, their frames, and one tile of them after another."""
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +23,8 @@ def surface(
     light: Iterable[tuple[str, Shape]],
     dtypes: Iterable[DTypeLike],
     **vectors: ArrayLike,
-) -> tuple[Lobes, dict[str, Array], Shape, Shape]:
-    """Lobes and flat arrays [p, 3] in the common dtype, the batch shape, and the colour of lobes and `light` together.
+) -> tuple[Lobes, dict[str, Array], Shape]:
+    """Lobes and arrays [..., 3] in the common dtype, and the colour of lobes and `light` together.
 
     `tangents` are taken where the material needs them, `light` names the colour axes of each light.
     """
@@ -34,15 +35,23 @@ def surface(
     arrays = {name: _checks.vectors(name, value) for name, value in vectors.items()}
     colours = [("lobes", lobes.colour), *light]
     try:
-        shape = np.broadcast_shapes(*(a.shape for a in arrays.values()))
+        np.broadcast_shapes(*(a.shape for a in arrays.values()))
         colour = np.broadcast_shapes(*(c for _, c in colours))
     except ValueError as error:
         shapes = {name: list(a.shape) for name, a in arrays.items()}
         named = " and ".join(f"`{name}` {list(c)}" for name, c in colours)
         raise ValueError(f"batch axes {shapes}, or colours of {named}, do not broadcast.") from error
     dtype = jnp.result_type(lobes.weights, *dtypes, *arrays.values())
-    flat = {name: jnp.broadcast_to(a.astype(dtype), shape).reshape(-1, 3) for name, a in arrays.items()}
-    return jax.tree.map(lambda x: x.astype(dtype), lobes), flat, shape[:-1], colour
+    cast = lambda x: x.astype(dtype)
+    return jax.tree.map(cast, lobes), jax.tree.map(cast, arrays), colour
+
+
+def shade_points(points: dict[str, Float[Array, "*_ 3"]], shade: Callable[..., Array], *arguments: Any) -> Array:
+    """`shade(points, *arguments)`, which takes flat points [p, 3]; instead of p, the result has their batch axes."""
+    shape = np.broadcast_shapes(*(a.shape for a in points.values()))
+    flat = {name: jnp.broadcast_to(a, shape).reshape(-1, 3) for name, a in points.items()}
+    values = shade(flat, *arguments)
+    return values.reshape(*shape[:-1], *values.shape[1:])
 
 
 def shade_tiles(

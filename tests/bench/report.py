@@ -1,4 +1,4 @@
-"""Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--output DIR] [--readme].
+"""Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--readme].
 
 Writes DIR/report.json with every row, DIR/report.md with tables, and a figure for each group of tasks; --readme also
 puts tables and figures into the README. `make report` sets the allocator as `make bench` does.
@@ -7,7 +7,6 @@ puts tables and figures into the README. `make report` sets the allocator as `ma
 import argparse
 import json
 import os
-import platform
 import time
 from pathlib import Path
 
@@ -71,7 +70,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     wanted = arguments.only or [*GROUPS, *TABLES]
     allocator = "tuned" if os.environ.get("MALLOC_MMAP_MAX_") == "0" else "default"
-    note = f"{os.cpu_count()} cores ({platform.machine()}), jax {jax.__version__}, default XLA flags, {allocator} allocator."
+    note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
     results, sections, start = {"machine": note, "rows": []}, {}, time.perf_counter()
 
     def keep(name: str, text: str) -> None:
