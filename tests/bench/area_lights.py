@@ -53,6 +53,7 @@ def shade(kernel: Callable, size: int, parameters, quad, positions, normals, vie
         x, sine = unit_and_length(minus(view, scale(cosine, z)))
         frame = x, cross(z, x), z
         local = [tuple(dot(axis, minus(tuple(c), tuple(position))) for axis in frame) for c in corners]
+        local, sine, cosine, frame = jax.lax.optimization_barrier((local, sine, cosine, frame))
         return kernel(parameters, Scene(local, sine, cosine, _shifts(index, position.dtype), frame))
 
     return jax.lax.map(jax.checkpoint(tile), (*rows, index)).reshape(-1)
@@ -179,23 +180,16 @@ def lattice(count: int) -> np.ndarray:
     return min((points(g) for g in range(1, count)), key=lambda x: np.sum(np.prod(bernoulli(x), axis=1)))
 
 
-def _sum(term: Callable, rows: np.ndarray, scene: Scene, together: int = 4) -> jax.Array:
-    """Sum of term(*row) over rows [S, n], S a multiple of `together`: pixels are the lanes, samples the loop."""
-
-    @jax.checkpoint
-    def step(total, rows):
-        for row in rows:
-            total += term(*row)
-        return total, None
-
-    rows = jnp.asarray(rows.reshape(-1, together, rows.shape[-1]), scene.sine.dtype)
-    return jax.lax.scan(step, jnp.zeros_like(scene.sine), rows)[0]
+def _sum(term: Callable, rows: np.ndarray, scene: Scene) -> jax.Array:
+    """Sum of term(*row) over rows [S, n]: pixels are the lanes, samples the loop, 5 to 10 times faster than [S, p]."""
+    step = jax.checkpoint(lambda total, row: (total + term(*row), None))
+    return jax.lax.scan(step, jnp.zeros_like(scene.sine), jnp.asarray(rows, scene.sine.dtype))[0]
 
 
 def _mean(term: Callable, count: int, scene: Scene) -> jax.Array:
     """Mean of term(u, v) over the lattice, shifted and folded."""
     shifted = lambda u, v: term(_fold(u + scene.shift[0]), _fold(v + scene.shift[1]))
-    return _sum(shifted, lattice(count), scene, min(count, 4)) * (1 / count)
+    return _sum(shifted, lattice(count), scene) * (1 / count)
 
 
 def _fold(x):
@@ -222,7 +216,7 @@ def gauss_points(side: int, material, scene: Scene):
         w, solid_angle = patch(u, v, scene.corners)
         return material.cosine_value(w, scene.sine, scene.cosine) * solid_angle * weight
 
-    return _sum(term, np.stack([u, v, np.outer(weight, weight).reshape(-1) / 4], axis=1), scene, side)
+    return _sum(term, np.stack([u, v, np.outer(weight, weight).reshape(-1) / 4], axis=1), scene)
 
 
 def patch(u, v, corners: list) -> tuple[Vector, jax.Array]:
@@ -332,7 +326,7 @@ def _hits(corners: list) -> Callable:
 
 def clipped_edges(corners: list) -> list:
     """The five edges (start, end) of the part of a convex quad above z = 0, with edges of no length below."""
-    leave = enter = (0.0, 0.0, 0.0)
+    leave = enter = (jnp.zeros_like(corners[0][2]),) * 3
     parts = []
     for a, b in zip(corners, corners[1:] + corners[:1], strict=True):
         above, above_next = a[2] > 0, b[2] > 0
@@ -346,7 +340,7 @@ def clipped_edges(corners: list) -> list:
     for a, b, above, above_next, crosses, at in parts:
         outside = where(crosses, at, leave)
         edges.append((where(above, a, outside), where(above_next, b, outside)))
-    return [*edges, (leave, enter)]
+    return jax.lax.optimization_barrier([*edges, (leave, enter)])  # else XLA makes the clipping again for every use
 
 
 def form_factor(corners: list):
