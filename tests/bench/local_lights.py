@@ -1,0 +1,350 @@
+"""Polygon lights, portals and projections of lights: ours beside sampling, quadrature and other closed forms.
+
+Scenes, float32, 16,384 points: a floor with slightly varied normals, views to 80 degrees from them, below a panel
+("floor") or beside a screen that stands on it, from 0.1 of its height on ("wall"). Materials as in `MATERIALS`.
+
+Families (kernels and their sources: `area_lights`): ours, `shade_polygon` with lobes fitted above the horizon; Gauss
+points on the light; Monte Carlo by area, by solid angle, by the material, by both, all with shifted lattices;
+linearly transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the light by Xu et al.'s
+rule; the light's harmonics, turned to the local frame; axial moments. Points and samples of a portal look the distant
+light up in a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the lobes'
+degree. Derivatives are measured in the full run, of
+ours, points and samples of the light, transformed cosines and 1 Gaussian, and of ours and points for projections.
+Those of points and samples are of the sum as it stands, without what happens where the light crosses the horizon, and
+by JAX's reverse mode, which XLA recomputes in many places: derivatives written by hand would be faster. Samples of the
+material have none, since what is lit or not jumps; of the other routes and of portals they are not measured.
+
+References: `reference.shade_polygon_quadrature` in float64 for the first 256 points, and for projections SciPy's
+harmonics on a rule for spherical triangles; errors are the differences to coarser rules.
+
+    python -m tests.bench.local_lights --make     writes tests/bench/data/references_local_lights.npz
+    python -m tests.bench.local_lights [--quick]  prints every row
+"""
+
+import functools
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shisd import decomposition, harmonics, models, reference, shading
+from tests.bench import area_lights, lobes, polygons
+from tests.bench.harness import Method, Task, run
+from tests.truth import scipy_basis, triangle_rule
+
+FILE = Path(__file__).parent / "data" / "references_local_lights.npz"
+COUNT, JUDGED = 16384, 256
+TILE, SMALL = 4096, 256  # pixels at a time: of loops over samples; of long formulas and of derivatives
+PROJECTIONS, PROJECTIONS_JUDGED = 2048, 32
+LIGHT_DEGREE = 12
+ALPHA = {"GGX 0.5": 0.5, "GGX 0.25": 0.25, "GGX 0.1": 0.1}
+MATERIALS = ("Lambertian", *ALPHA)
+QUADS = {  # counter-clockwise seen from where they shine
+    "floor": np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]], np.float32),
+    "wall": np.array([[1, 0, 0], [-1, 0, 0], [-1, 0, 1], [1, 0, 1]], np.float32),
+}
+AREAS = {"floor": ([-2, -2], [2, 2]), "wall": ([-1.5, 0.1], [1.5, 2])}
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def points(scene: str) -> tuple[np.ndarray, ...]:
+    """Positions, normals and views [N, 3]."""
+    rng = np.random.default_rng(0)
+    low, high = (np.array([*x, 0.0]) for x in AREAS[scene])
+    positions = rng.uniform(low, high, (COUNT, 3))
+    normals = unit([0, 0, 1] + 0.15 * rng.normal(size=(COUNT, 3)))
+    cosine, azimuth = rng.uniform(np.cos(lobes.STEEPEST), 1, (COUNT, 1)), rng.uniform(0, 2 * np.pi, (COUNT, 1))
+    x = unit(np.cross(normals, [0.3, 0.5, -0.7]))
+    side = np.cos(azimuth) * x + np.sin(azimuth) * np.cross(normals, x)
+    views = cosine * normals + np.sqrt(1 - cosine**2) * side
+    return tuple(a.astype(np.float32) for a in (positions, normals, views))
+
+
+def brdf(name: str):
+    return models.Lambertian(0.8) if name == "Lambertian" else models.Ggx(ALPHA[name], 0.04)
+
+
+def lanes(name: str):
+    """The same for `area_lights`."""
+    f = jnp.float32
+    return area_lights.Diffuse(f(0.8)) if name == "Lambertian" else area_lights.Microfacet(f(ALPHA[name]), f(0.04))
+
+
+# ---- what is run
+
+
+def shade_polygon(parameters, quad, *rows):
+    return shading.shade_polygon(parameters, models.PolygonLight(quad), *rows)
+
+
+def shade_portal(parameters, quad, *rows):
+    lobes, portal = parameters
+    return shading.shade_portal(lobes, eqx.tree_at(lambda p: p.points, portal, quad), *rows)
+
+
+@functools.cache
+def shaded(kernel, *static, size: int = TILE):
+    return functools.partial(area_lights.shade, functools.partial(kernel, *static) if static else kernel, size)
+
+
+@functools.cache
+def through(kernel, count: int):
+    return shaded(area_lights.portal, kernel, count)
+
+
+@functools.cache
+def radiance_gradient(forward):
+    """The sum of radiance, and its gradient in the outline, positions and views."""
+
+    def total(quad, positions, views, parameters, normals):
+        return jnp.sum(forward(parameters, quad, positions, normals, views))
+
+    gradient = jax.value_and_grad(total, (0, 1, 2))
+    return lambda parameters, quad, positions, normals, views: gradient(quad, positions, views, parameters, normals)
+
+
+@functools.cache
+def project_light(degree: int):
+    return lambda weights, quad, positions: shading.project_light(models.PolygonLight(quad), positions, degree)
+
+
+@functools.cache
+def projected(kernel, *static, size: int = 128):
+    return functools.partial(area_lights.project, functools.partial(kernel, *static), size)
+
+
+@functools.cache
+def projection_gradient(forward):
+    """A weighted sum of coefficients, and its gradient in the outline and positions; the weights are the parameters."""
+    total = lambda quad, positions, weights: jnp.sum(forward(weights, quad, positions) * weights[None])
+    gradient = jax.value_and_grad(total, (0, 1))
+    return lambda weights, quad, positions: gradient(quad, positions, weights)
+
+
+# ---- what is made once for a scene
+
+
+def timed(function, *arguments):
+    """The result, and the seconds it took: compiling included where it is the first of its kind."""
+    start = time.perf_counter()
+    result = jax.block_until_ready(function(*arguments))
+    return result, time.perf_counter() - start
+
+
+@functools.cache
+def fitted_lobes(name: str, degree: int):
+    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+    return timed(functools.partial(shading.tabulate_brdf, domain="upper"), brdf(name), basis)
+
+
+@functools.cache
+def fitted_cosines(name: str):
+    table, seconds = timed(polygons.fit_ltc, brdf(name), 64)
+    return jax.tree.map(lambda x: x.astype(jnp.float32), table), seconds
+
+
+@functools.cache
+def fitted_gaussians(name: str, count: int):
+    table, seconds = timed(lobes.fit_table, brdf(name), count)
+    rows = [table.directions, jnp.log(table.sharpness)[..., None], table.weights[..., None]]
+    return jnp.concatenate(rows, axis=-1).reshape(lobes.VIEWS, -1), seconds
+
+
+# ---- tasks
+
+
+def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
+    half = slice(None, None, 2) if quick else slice(None)
+    methods, material = [], lanes(name)
+
+    def add(family, setting, forward, parameters, differentiated=None, **more):
+        gradient = None if quick or differentiated is None else radiance_gradient(differentiated)
+        methods.append(Method(family, setting, forward, parameters, gradient, **more))
+
+    degrees = (1, 2, 4, 8) if name == "Lambertian" else (4, 8, 12, 20)
+    for degree in degrees[half]:
+        table, seconds = fitted_lobes(name, degree)
+        add("shisd", f"degree {degree}", shade_polygon, table, shade_polygon, setup=seconds, ours=True)
+    for family, kernel, differentiable in (
+        ("Gauss points", area_lights.gauss_points, True),
+        ("Monte Carlo, area", area_lights.by_area, True),
+        ("Monte Carlo, solid angle", area_lights.by_solid_angle, True),
+        ("Monte Carlo, BRDF", area_lights.by_brdf, False),
+        ("Monte Carlo, MIS", area_lights.by_both, False),
+    ):
+        for side in (2, 4, 8, 16)[half]:
+            gauss = family == "Gauss points"
+            count, setting = (side, f"{side} x {side}") if gauss else (side * side, f"{side * side} samples")
+            small = shaded(kernel, count, size=SMALL) if differentiable else None
+            add(family, setting, shaded(kernel, count), material, small)
+    table, seconds = fitted_cosines(name)
+    kernel = shaded(area_lights.transformed_cosines, size=SMALL)
+    add("linearly transformed cosines", "64 views", kernel, table, kernel, setup=seconds)
+    for count in () if quick or name == "Lambertian" else (1, 3):
+        table, seconds = fitted_gaussians(name, count)
+        kernel = shaded(area_lights.gaussians, 4, size=SMALL)
+        add("spherical Gaussians", f"{count} for a view", kernel, table, kernel if count == 1 else None, setup=seconds)
+    for degree in (4,) if quick else (4, 8, 12):
+        table, seconds = fitted_lobes(name, degree)
+        for family, kernel in (("SH rotation", area_lights.turned_harmonics), ("axial moments", area_lights.axial)):
+            kernel = shaded(kernel, degree, size=128)
+            add(family, f"degree {degree}", kernel, area_lights.slices(table), setup=seconds)
+    return Task(
+        f"polygon-lit {scene}, {name}",
+        f"{name}, {'floor below a panel' if scene == 'floor' else 'floor beside a screen'}",
+        "pixel",
+        (QUADS[scene], *points(scene)),
+        stored[f"{scene} {name}"],
+        float(stored[f"{scene} {name} error"]),
+        methods,
+        count=COUNT,
+    )
+
+
+def portal_task(name: str, stored) -> Task:
+    coefficients, methods = stored["portal light"], []
+    for degree in (4, 8, 12):
+        table, seconds = fitted_lobes(name, degree)
+        light, more = timed(models.PortalLight, QUADS["floor"], coefficients, degree)
+        parameters = table, light
+        own = Method("shisd", f"degree {degree}", shade_portal, parameters, setup=seconds + more, ours=True)
+        product, more = timed(functools.partial(harmonics.product_matrix, input_degree=degree), coefficients, degree)
+        parameters, kernel = (area_lights.slices(table), product), shaded(area_lights.triple_products, degree, size=128)
+        methods += [own, Method("SH triple product", f"degree {degree}", kernel, parameters, setup=seconds + more)]
+    lookup = functools.partial(harmonics.evaluate, coefficients)
+    texels, seconds = timed(lookup, area_lights.octahedron(513).astype(np.float32))
+    for family, kernel, counts in (
+        ("Gauss points", area_lights.gauss_points, (2, 4, 8, 16)),
+        ("Monte Carlo, area", area_lights.by_area, (4, 16, 64, 256)),
+        ("Monte Carlo, solid angle", area_lights.by_solid_angle, (4, 16, 64, 256)),
+    ):
+        for count in counts:
+            setting = f"{count} x {count}" if family == "Gauss points" else f"{count} samples"
+            kernel_of = through(kernel, count)
+            methods.append(Method(family, setting, kernel_of, (lanes(name), texels), setup=seconds))
+    return Task(
+        f"portal, {name}",
+        f"{name}, a window onto light of degree {LIGHT_DEGREE}",
+        "pixel",
+        (QUADS["floor"], *points("floor")),
+        stored[f"portal {name}"],
+        float(stored[f"portal {name} error"]),
+        methods,
+        count=COUNT,
+    )
+
+
+def projection_task(degree: int, stored, quick: bool) -> Task:
+    """At one degree: what each method reaches for the same coefficients."""
+    half = slice(None, None, 2) if quick else slice(None)
+    size = (degree + 1) ** 2
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=size) / degree, jnp.float32)
+    gradient = (lambda forward: None) if quick else projection_gradient
+    forward = project_light(degree)
+    methods = [Method("shisd", f"degree {degree}", forward, weights, gradient(forward), ours=True)]
+    for family, gauss in (("Gauss points", True), ("Monte Carlo, solid angle", False)):
+        for count in (16, 64, 256)[half]:
+            setting = f"{int(count**0.5)} x {int(count**0.5)}" if gauss else f"{count} samples"
+            kernel = projected(area_lights.project_points, degree, count, gauss, size=max(16, 2048 // count))
+            methods.append(Method(family, setting, kernel, weights, gradient(kernel) if gauss else None))
+    kernel = projected(area_lights.project_lines, degree)
+    methods.append(Method("line quadrature", f"degree {degree}", kernel, weights))
+    if degree <= 16:
+        kernel = projected(area_lights.project_axial, degree)
+        methods.append(Method("axial moments", f"degree {degree}", kernel, weights))
+    return Task(
+        f"projection of a light, degree {degree}",
+        f"A quad on harmonics of degree {degree}",
+        "integral",
+        (QUADS["floor"], points("floor")[0][:PROJECTIONS]),
+        stored["projection"][:, :size],
+        float(stored["projection error"]),
+        methods,
+        count=PROJECTIONS,
+    )
+
+
+def tasks(quick: bool) -> list[Task]:
+    stored = np.load(FILE)
+    if quick:
+        return [polygon_task("floor", "GGX 0.5", stored, True), projection_task(8, stored, True)]
+    return [
+        *(polygon_task("floor", name, stored, False) for name in MATERIALS),
+        *(polygon_task("wall", name, stored, False) for name in MATERIALS[:3]),
+        *(portal_task(name, stored) for name in ("Lambertian", "GGX 0.5")),
+        *(projection_task(degree, stored, False) for degree in (4, 8, 16, 30)),
+    ]
+
+
+# ---- references
+
+
+def distant_light() -> np.ndarray:
+    """Luminance of the room `interior` at degree 12, its panes seen through the window, mean 1."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the notes on texels that were clamped
+        c = np.asarray(lobes.load_map("interior").coefficients(LIGHT_DEGREE), float)
+    c = np.array([0.2126, 0.7152, 0.0722]) @ c
+    return (c / (c[0] / np.sqrt(4 * np.pi))).astype(np.float32)
+
+
+def relative(a, b) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)))
+
+
+def make() -> None:
+    stored = {"portal light": distant_light()}
+
+    def add(key, values, coarse):
+        stored[key] = values.astype(np.float32)
+        stored[f"{key} error"] = max(relative(coarse, values), 3e-8)  # of rounding to float32
+        print(f"{key}: error of the reference {stored[f'{key} error']:.1e}", flush=True)
+
+    with jax.enable_x64(True):
+        light = jnp.asarray(stored["portal light"], float)
+        expansion = lambda w: harmonics.evaluate(light, w)
+        jobs = [("floor", name, 1.0, f"floor {name}", 64) for name in MATERIALS]
+        jobs += [("wall", name, 1.0, f"wall {name}", 128) for name in MATERIALS[:3]]
+        jobs += [("floor", name, expansion, f"portal {name}", 32) for name in ("Lambertian", "GGX 0.5")]
+        for scene, name, radiance, key, nodes in jobs:
+            rows = [x[:JUDGED].astype(float) for x in points(scene)]
+            judge = lambda nodes, name=name, scene=scene, radiance=radiance, rows=rows: np.asarray(
+                reference.shade_polygon_quadrature(brdf(name), QUADS[scene].astype(float), radiance, *rows, nodes=nodes)
+            )
+            add(key, judge(nodes), judge(3 * nodes // 4))
+    seen = [unit(QUADS["floor"].astype(float) - p) for p in points("floor")[0][:PROJECTIONS_JUDGED]]
+
+    def coefficients(nodes):
+        rules = [triangle_rule(v[::-1], nodes) for v in seen]
+        return np.stack([area.astype(float) @ scipy_basis(w.astype(float), 30) for w, area in rules])
+
+    add("projection", coefficients(24), coefficients(18))
+    FILE.parent.mkdir(exist_ok=True)
+    np.savez_compressed(FILE, **stored)
+
+
+def main() -> None:
+    if "--make" in sys.argv:
+        return make()
+    for task in tasks("--quick" in sys.argv):
+        start = time.perf_counter()
+        rows = run(task)
+        print(f"\n{task.name}: {time.perf_counter() - start:.0f} s, error of the reference {task.reference_error:.1e}")
+        for r in rows:
+            gradient = "" if r["with gradient"] is None else f"{r['with gradient']:9.3f}"
+            setup = "" if r["setup s"] is None else f"{r['setup s']:.2f}"
+            print(f"{r['family']:30s} {r['setting']:13s} {r[f'us/{task.item}']:9.3f} {gradient:9s} "
+                  f"{r['relative RMSE']:.1e} {r['max error / max']:.1e} {r['first call s']:5.1f} "
+                  f"{r['first gradient s'] or 0:5.1f} {r['MB']:7.1f} {setup}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
