@@ -307,8 +307,8 @@ def _scipy_basis(degree: int):
     """By its recurrence over all degrees and orders, several times faster than by pairs."""
 
     def value(d):
-        theta, phi = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
-        y = sph_harm_y_all(degree, degree, theta, phi)
+        x, y, z = d.T
+        y = sph_harm_y_all(degree, degree, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x))
         columns = []
         for l in range(degree + 1):
             columns += [np.sqrt(2) * y[l, -m].imag for m in range(-l, 0)]
