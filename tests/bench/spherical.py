@@ -8,9 +8,10 @@ turned directions and rotations instead, and coefficients stay as they are. ducc
 before the call; after it, only those that are judged. XLA, sphericart and ducc0 may use every core, except that loops
 over many small transforms of ducc0 run on one thread, which is faster.
 
-Settings that are missing: e3nn-jax and spexial beyond degree 8, which take long to compile; SciPy beyond degree 16,
-which takes seconds for a call; s2fft for all but one map, since its sampling ties the degree to the number of rows, so
-that it computes degree 255 of any map with 512. Peers that are not installed are left out: `notes` names them.
+Settings that are missing: e3nn-jax and spexial beyond degree 8, and gradients of e3nn's basis at that degree and of
+`rotate` at degree 30, which take long to compile; SciPy beyond degree 16, which takes seconds for a call; s2fft for all
+but one map, since its sampling ties the degree to the number of rows, so that it computes degree 255 of any map with
+512. Peers that are not installed are left out: `notes` names them.
 """
 
 import functools
@@ -38,10 +39,11 @@ PEERS = {  # by module
     "s2fft": "s2fft",
     "spexial": "spexial",
 }
-POINTS, HEIGHT, ROTATIONS, EXPANSIONS, PRODUCTS = 10_000, 512, 1000, 4096, 64
+POINTS, HEIGHT, ROTATIONS, EXPANSIONS, PRODUCTS = 10_000, 512, 1000, 1024, 64
 POINTS_JUDGED, ROTATIONS_JUDGED, EXPANSIONS_JUDGED, PRODUCTS_JUDGED = 200, 4, 8, 2
-ROTATION_DEGREES, BATCH_DEGREES = (4, 8, 16, 30), (8, 30)
+ROTATION_DEGREES, BATCH_DEGREES = (8, 16, 30), (8, 30)
 SMALL = 8  # the highest degree of e3nn-jax, spexial and the dense tensor of triple products
+DIFFERENTIATED = 30  # the highest degree of gradients: at 64, sphericart's table of derivatives takes 1 GB in float64
 S2FFT_DEGREE = HEIGHT // 2 - 1
 HALF_TURN = np.diag([-1, -1, 1]).astype(np.float32)  # sphericart's harmonics at HALF_TURN w are ours at w
 E3NN_TURN = np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], np.float32)  # and so are e3nn's at E3NN_TURN w
@@ -71,7 +73,7 @@ def tasks(quick: bool) -> list[Task]:
         projection: (8, 64),
         rotation: ROTATION_DEGREES,
         batch_rotation: BATCH_DEGREES,
-        product: (4, 8, 16, 30),
+        product: (8, 16, 30),
     }
     if quick:
         jobs = {basis: (8, 30), expansion: (30,), projection: (64,), rotation: (8,), product: (8,)}
@@ -221,7 +223,7 @@ def basis(degree: int, quick: bool) -> Task:
     """All harmonics at 10,000 directions; the gradient is in the directions."""
     d, w = directions(), normal(1, POINTS, size(degree))
     reference, error = judged_basis(degree)
-    small, differentiated = degree <= SMALL and not quick, degree <= 30  # beyond, sphericart's derivatives take 500 MB
+    small, differentiated = degree <= SMALL and not quick, degree <= DIFFERENTIATED
     methods = [
         compiled("shisd", "float32", _basis(degree), d, w, gradient=differentiated, ours=True),
         in_double("shisd", "float64", _basis(degree), d, ours=True),
@@ -236,7 +238,9 @@ def basis(degree: int, quick: bool) -> Task:
         value = _sphericart_jax(degree)
         methods.append(compiled("sphericart-jax", "float32", value, d @ HALF_TURN, w, gradient=differentiated))
     if installed("e3nn_jax") and small:
-        methods.append(compiled("e3nn-jax", "float32", _e3nn_basis(degree), d @ E3NN_TURN.T, w))
+        methods.append(
+            compiled("e3nn-jax", "float32", _e3nn_basis(degree), d @ E3NN_TURN.T, w, gradient=degree < SMALL)
+        )
     if installed("spexial") and small:
         methods.append(compiled("spexial", "float32", _spexial_basis(degree), d, w))
     if degree <= 16 and not quick:
@@ -326,9 +330,9 @@ def expansion(degree: int, quick: bool) -> Task:
     c, d, w = normal(2, size(degree)), directions(), normal(3, POINTS)
     y, error = judged_basis(degree)
     reference = y @ c.astype(float)
-    small = degree <= SMALL and not quick
+    small, differentiated = degree <= SMALL and not quick, degree <= DIFFERENTIATED
     methods = [
-        compiled("shisd", "float32", _expansion, c, d, w, ours=True),
+        compiled("shisd", "float32", _expansion, c, d, w, gradient=differentiated, ours=True),
         in_double("shisd", "float64", _expansion, c, d, ours=True),
     ]
     if installed("sphericart"):
@@ -336,16 +340,30 @@ def expansion(degree: int, quick: bool) -> Task:
         for dtype in (np.float32, np.float64):
             turned = np.ascontiguousarray((d @ HALF_TURN).astype(dtype))
             arguments = c.astype(dtype), turned, w.astype(dtype)
-            methods.append(on_host("sphericart", dtype.__name__, value, *arguments, gradient=gradient))
+            methods.append(
+                on_host("sphericart", dtype.__name__, value, *arguments, gradient=gradient if differentiated else None)
+            )
     if installed("sphericart.jax"):
-        methods.append(compiled("sphericart-jax", "float32", _sphericart_jax_expansion(degree), c, d @ HALF_TURN, w))
+        methods.append(
+            compiled(
+                "sphericart-jax",
+                "float32",
+                _sphericart_jax_expansion(degree),
+                c,
+                d @ HALF_TURN,
+                w,
+                gradient=differentiated,
+            )
+        )
     if installed("ducc0"):
         value, gradient = _ducc_expansion(degree)
         x, y, z = d.T.astype(float)
         place = np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x) % (2 * np.pi)], axis=-1)
         for dtype in (np.float32, np.float64):
             arguments = to_complex(c).astype(np.result_type(dtype, np.complex64))[None], place, w.astype(dtype)
-            methods.append(on_host("ducc0", dtype.__name__, value, *arguments, gradient=gradient))
+            methods.append(
+                on_host("ducc0", dtype.__name__, value, *arguments, gradient=gradient if differentiated else None)
+            )
     if installed("e3nn_jax") and small:
         value = _e3nn_expansion(degree)
         methods.append(compiled("e3nn-jax", "float32", value, c / E3NN_SCALE, d @ E3NN_TURN.T, w))
@@ -489,7 +507,7 @@ def rotation(degree: int, quick: bool) -> Task:
     c, r, w = normal(6, 3, size(degree)), rotations(ROTATIONS), normal(7, ROTATIONS, 3, size(degree))
     single = r.astype(np.float32)
     methods = [
-        compiled("shisd", "rotate, float32", _rotations, c, single, w, ours=True),
+        compiled("shisd", "rotate, float32", _rotations, c, single, w, gradient=degree <= 16, ours=True),
         compiled("shisd", "rotate_many, float32", _rotate_many(degree), c, single, w, ours=True),
         in_double("shisd", "rotate_many, float64", _rotate_many(degree), c, r, ours=True),
     ]
@@ -507,12 +525,13 @@ def rotation(degree: int, quick: bool) -> Task:
 
 
 def batch_rotation(degree: int, quick: bool) -> Task:
-    """4,096 expansions turned by one rotation; the gradient is in coefficients and the rotation."""
+    """1,024 expansions turned by one rotation; the gradient is in coefficients and the rotation."""
     c, r, w = normal(8, EXPANSIONS, size(degree)), rotations(1)[0], normal(9, EXPANSIONS, size(degree))
     single = r.astype(np.float32)
     methods = [
-        compiled("shisd", "float32", _rotation, c, single, w, ours=True),
-        in_double("shisd", "float64", _rotation, c, r, ours=True),
+        compiled("shisd", "rotate, float32", _rotation, c, single, w, ours=True),
+        compiled("shisd", "rotate_many, float32", _rotate_each(degree), c, single, w, ours=True),
+        in_double("shisd", "rotate_many, float64", _rotate_each(degree), c, r, ours=True),
     ]
     if installed("ducc0"):
         value = _ducc_rotation(degree)
@@ -522,7 +541,7 @@ def batch_rotation(degree: int, quick: bool) -> Task:
     if installed("e3nn_jax") and degree <= SMALL and not quick:
         methods.append(compiled("e3nn-jax", "float32", _e3nn_rotation(degree), c, E3NN_TURN @ single @ E3NN_TURN.T, w))
     reference, error = judged("batch", degree)
-    title = f"One rotation of 4,096 expansions, degree {degree}"
+    title = f"One rotation of 1,024 expansions, degree {degree}"
     return Task(f"batch rotation {degree}", title, "expansion", (), reference, error, methods, count=EXPANSIONS)
 
 
@@ -556,6 +575,12 @@ def _rotations(c, r):
 @functools.cache
 def _rotate_many(degree: int):
     return lambda c, r: jnp.moveaxis(rotate_many(c, r, degree), -1, 0).swapaxes(1, 2)
+
+
+@functools.cache
+def _rotate_each(degree: int):
+    """`rotate_many` told that expansions are its own of each rotation, of which there is one."""
+    return lambda c, r: rotate_many(c.T[..., None], r[None], degree)[..., 0].T
 
 
 @functools.cache
