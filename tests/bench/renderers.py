@@ -88,8 +88,8 @@ def tasks(quick: bool) -> list[Task]:
 def picture(name: str) -> Task:
     with np.load(STORED) as stored:
         reference, error = stored[name].astype(float), float(stored[f"{name} noise"])
-    rays, order = rays_of(name), np.concatenate([judged(name), np.flatnonzero(~np.isin(every(), judged(name)))])
-    rays = jnp.asarray(rays.reshape(-1, 3)[order], jnp.float32)
+    order = np.concatenate([judged(name), np.setdiff1d(np.arange(SIZE * SIZE), judged(name))])
+    rays = jnp.asarray(rays_of(name).reshape(-1, 3)[order], jnp.float32)
     methods = [ours(name, degree, rays) for degree in DEGREES]
     for variant in variants():
         methods += [mitsuba_method(name, variant, samples, order) for samples in SAMPLES[variant]]
@@ -132,10 +132,6 @@ def equal_error(rows: list[dict]) -> list[dict]:
 
 
 # ---- pixels
-
-
-def every() -> np.ndarray:
-    return np.arange(SIZE * SIZE)
 
 
 def rays_of(name: str, shift: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:

@@ -244,7 +244,7 @@ def basis(degree: int, quick: bool) -> Task:
     if installed("spexial") and small:
         methods.append(compiled("spexial", "float32", _spexial_basis(degree), d, w))
     if degree <= 16 and not quick:
-        methods.append(on_host("SciPy", "float64", _scipy_basis(degree), d.astype(float), w))
+        methods.append(on_host("SciPy, the reference", "float64", _scipy_basis(degree), d.astype(float), w))
     title = f"Basis, degree {degree}"
     return Task(f"basis {degree}", title, "direction", (), reference, error, methods, count=POINTS)
 
