@@ -507,7 +507,7 @@ def rotation(degree: int, quick: bool) -> Task:
     c, r, w = normal(6, 3, size(degree)), rotations(ROTATIONS), normal(7, ROTATIONS, 3, size(degree))
     single = r.astype(np.float32)
     methods = [
-        compiled("shisd", "rotate, float32", _rotations, c, single, w, gradient=degree <= 16, ours=True),
+        compiled("shisd", "rotate, float32", _rotations, c, single, w, gradient=degree <= 16 and not quick, ours=True),
         compiled("shisd", "rotate_many, float32", _rotate_many(degree), c, single, w, ours=True),
         in_double("shisd", "rotate_many, float64", _rotate_many(degree), c, r, ours=True),
     ]
