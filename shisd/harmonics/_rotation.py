@@ -46,7 +46,10 @@ def _rotate(c: Float[Array, "*batch n"], r: Float[Array, "3 3"], degree: int) ->
     handed = jnp.dot(jnp.cross(r[:, 0], r[:, 1]), r[:, 2])
     bad = ~(jnp.all(drift < 1e-3) & (handed > 0))
     r = eqx.error_if(r, bad, "`rotation` must be orthonormal with determinant +1 (R^T R = 1, right-handed).")
-    return rotate_many(c.reshape(-1, c.shape[-1]), r[None], degree)[..., 0].T.reshape(c.shape)
+    flat = c.reshape(-1, c.shape[-1])
+    if flat.shape[0] > 8:  # then not the series in the first angle, which pays where many rotations share an expansion
+        flat = flat.T[..., None]
+    return rotate_many(flat, r[None], degree)[..., 0].T.reshape(c.shape)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
