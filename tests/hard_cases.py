@@ -1,4 +1,7 @@
-"""Polygons and axes on which formulas for spherical polygons fail, one list for every test."""
+"""Input on which formulas fail: directions, sets of axes, polygons, scenes, materials and lights, one list for every test.
+
+Every case that has a name here is a row of tests/bench/stability.py.
+"""
 
 import numpy as np
 
@@ -55,3 +58,75 @@ def axes_for(vertices, rng):
         rng.normal(size=(4, 3)),
         [a, -a, unit(a + 0.3 * b), np.cross(a, b) if np.linalg.norm(np.cross(a, b)) else a, unit(vertices.sum(axis=0))],
     ]))  # fmt: skip
+
+
+# ---- harmonics: directions [N, 3] of any length, and the degree
+
+_NEAR = ring(np.arange(6) + 0.2, 1e-4)
+_AROUND = unit(np.random.default_rng(7).normal(size=(6, 3)))
+HARMONICS = {
+    "both poles": (np.array([[0.0, 0, 1], [0, 0, -1]]), 32),
+    "1e-4 rad from the poles": (np.concatenate([_NEAR, -_NEAR]), 32),
+    "1e-4 rad from the poles, degree 8": (np.concatenate([_NEAR, -_NEAR]), 8),
+    "degree 100": (np.concatenate([_AROUND, _NEAR]), 100),
+    "degree 200": (np.concatenate([_AROUND, _NEAR]), 200),
+    "vectors of length 1e-30": (1e-30 * _AROUND, 16),
+    "zero vector": (np.zeros((1, 3)), 16),
+}
+
+
+# ---- sets of axes
+
+
+def axis_sets(degree):
+    """Sets of axes by name; the last two can be resolved, in exact arithmetic and up to rounding."""
+    count, spread = 2 * degree + 1, np.random.default_rng(3).normal(size=(2 * degree + 3, 3))
+    spread, turn = unit(spread), 2 * np.pi * np.arange(count) / count
+    circle = lambda z: np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z + 0 * turn], 1)
+    close = unit(spread[:1] + 1e-4 * spread[1:2])
+    return {
+        "two equal axes": np.concatenate([spread[:1], spread[: count - 1]]),
+        "two opposite axes": np.concatenate([-spread[:1], spread[: count - 1]]),
+        "all axes in a plane": circle(0.0),
+        "2L+1 axes on a circle": circle(0.6),
+        "two axes 1e-4 rad apart": np.concatenate([close, spread[: count - 1]]),
+        "two equal axes, enough others": np.concatenate([spread[:1], spread]),
+    }
+
+
+# ---- polygons beyond those above
+
+
+BEYOND_A_HEMISPHERE = ring(np.arange(8) * np.pi / 4, 1.9, (1, -1, 0.3))
+OPPOSITE_VERTICES = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, -1]])[[0, 2, 3]]  # an edge of exactly pi
+_FLAT = unit([[1, 0.2, 0], [0.3, 1, 0], [0.1, 0.3, 1]])  # its first edge is in the plane z = 0
+AXES_AT_POLYGONS = {
+    "vertex at the axis": (_QUAD, _QUAD[0]),
+    "vertex opposite to the axis": (_QUAD, -_QUAD[0]),
+    "axis in the plane of an edge": (_FLAT, unit([-0.4, 1, 0])),
+    "axis on an edge": (_FLAT, unit([1, 1, 0])),
+    "axis normal to an edge": (_FLAT, np.array([0.0, 0, 1])),
+}
+
+
+# ---- shading by a polygon: points of the light, and position, normal and view of the surface
+
+
+_LIGHT = [[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.25], [0.5, 0.5, 1.25], [0.5, -0.5, 1.0]]  # emits downwards
+_LIGHT_NEAR = [[-0.5, -0.5, 1e-4], [-0.5, 0.5, 1e-4], [0.5, 0.5, 1e-4], [0.5, -0.5, 1e-4]]
+_DENTED = [[-0.5, -0.5, 1.0], [0, -0.25, 1.0], [-0.5, 0.5, 1.0], [0.5, -0.5, 1.0]]
+_UP, _ORIGIN, _ASIDE = [0.0, 0, 1], [0.0, 0, 0], [0.375, -0.25, 0.625]
+_WALL = [[1, -0.5, 0.25], [1, -0.5, 1], [1, 0.75, 0.75], [1, 0.75, 0.5]]  # faces the origin
+SHADING = {
+    "light straddling the horizon": ([[1, -0.5, -0.75], [1, -0.5, 0.75], [1, 0.5, 1], [1, 0.75, -0.5]], _ORIGIN, _UP, _ASIDE),
+    "light with an edge on the horizon": ([[1, -0.5, 0], [1.25, -0.5, 0.75], [1.125, 0.5, 1], [1, 0.5, 0]], _ORIGIN, _UP, _ASIDE),
+    "light with a corner on the horizon": ([[1, 0, 0], [1.25, -0.5, 0.75], [1.125, 0.25, 1], [1, 0.5, 0.25]], _ORIGIN, _UP, _ASIDE),
+    "light wholly below the horizon": ([[1, -0.5, -0.75], [1, -0.5, -0.25], [1, 0.5, -0.25], [1, 0.5, -0.5]], _ORIGIN, _UP, _ASIDE),
+    "point in the light's plane": ([[1, 0, 0.25], [2, 0, 0.25], [2, 0, 1], [1, 0, 1.5]], _ORIGIN, _UP, _ASIDE),
+    "point 1e-4 away from the light": (_LIGHT_NEAR, _ORIGIN, _UP, _ASIDE),
+    "clockwise winding, seen from behind": (_LIGHT[::-1], _ORIGIN, _UP, _ASIDE),
+    "non-convex light": (_DENTED, _ORIGIN, _UP, _ASIDE),
+    "view 89.9 degrees from the normal": (_WALL, _ORIGIN, _UP, [np.sin(np.radians(89.9)), 0.0, np.cos(np.radians(89.9))]),
+    "view at the normal": (_WALL, _ORIGIN, _UP, _UP),
+    "view at a normal off the axes": (_WALL, _ORIGIN, [-0.25, 0.125, 1.0], [-0.25, 0.125, 1.0]),
+}  # fmt: skip
