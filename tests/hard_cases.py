@@ -130,3 +130,41 @@ SHADING = {
     "view at the normal": (_WALL, _ORIGIN, _UP, _UP),
     "view at a normal off the axes": (_WALL, _ORIGIN, [-0.25, 0.125, 1.0], [-0.25, 0.125, 1.0]),
 }  # fmt: skip
+
+
+# ---- materials: alpha of GGX (0.02^2 is what a metallic-roughness material of roughness 0.02 has), and directions
+
+
+def _polar(degrees, azimuth=0.0):
+    theta = np.radians(degrees)
+    return np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
+
+
+MATERIALS = {  # alpha, wi, wo
+    "roughness 0.02, in the lobe": (0.02, _polar(41.0, np.pi + 0.01), _polar(40.0)),
+    "roughness 0.02, far from the lobe": (0.02, _polar(20.0, 1.0), _polar(40.0)),
+    "roughness 0.02 squared, in the lobe": (0.0004, _polar(40.02, np.pi + 3e-4), _polar(40.0)),
+    "roughness 1": (1.0, _polar(20.0, 1.0), _polar(40.0)),
+    "view 89.9 degrees from the normal": (0.5, _polar(70.0, 2.0), _polar(89.9)),
+    "view 89.9 degrees from the normal, roughness 0.02": (0.02, _polar(89.0, 3.12), _polar(89.9)),
+    "view and light at the normal": (0.3, _polar(0.0), _polar(0.0)),
+}
+
+
+# ---- distant light: texels [H, 2H]
+
+
+def _texels(sky, **points):
+    texels = np.full((16, 32), sky)
+    for at, value in points.values():
+        texels[at] = value
+    return texels
+
+
+LIGHTS = {
+    "sun of 3e4 over a sky of 0.5": _texels(0.5, sun=((4, 9), 3e4)),
+    "all black": _texels(0.0),
+    "one texel": _texels(0.0, spot=((7, 20), 1.0)),
+    "one texel at the zenith": _texels(0.0, spot=((0, 3), 1.0)),
+}
+BAD_TEXELS = _texels(0.5, nan=((2, 3), np.nan), infinite=((5, 6), np.inf), bright=((8, 1), 20.0))

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -330,3 +331,435 @@ def plain_moments(v, axes):
     _, rest = jax.lax.scan(step, start, jnp.arange(1, POLYGON_DEGREE + 1, dtype=v.dtype))
     moments = jnp.broadcast_to(2 * jnp.sum(jnp.arctan2(volume, along)), (1, len(axes)))
     return jnp.concatenate([moments, rest]).T
+
+
+# ---- shading by polygons
+
+
+def shading_rows():
+    scenes = {name: [np.float32(x) for x in scene] for name, scene in hard_cases.SHADING.items()}
+    results = {}
+    brdf = models.Ggx(0.5, 0.04)
+    with jax.enable_x64(True):
+        exact_slice = eqx.filter_jit(tabulated(brdf, np.float64, domain="upper").slice_coefficients)
+        expected = {name: polygon_truth(name, scene, exact_slice) for name, scene in scenes.items()}
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64):
+            lobes = tabulated(brdf, dtype, domain="upper")
+            shade = lambda points, *surface, lobes=lobes: shading.shade_polygon(
+                lobes, models.PolygonLight(points), *surface
+            )
+            stacked = [jnp.asarray(np.stack(x), dtype) for x in zip(*scenes.values(), strict=True)]
+            got, slopes = jax.jit(jax.vmap(jax.value_and_grad(shade, (0, 1, 2, 3))))(*stacked)
+            slopes = [np.asarray(s, float) for s in slopes]
+            for i, name in enumerate(scenes):
+                points, *surface = (x[i] for x in stacked)
+                estimate = reference.shade_polygon(
+                    brdf, points, 1.0, *(x[None] for x in surface), key=jax.random.key(0), samples=256
+                ).value[0]
+                value, of_material, tries = expected[name]
+                results.setdefault(name, []).append((
+                    cell(largest(got[i], value)),
+                    cell(slope_error([s[i] for s in slopes], tries)),
+                    several([cell(largest(estimate, of_material))]),
+                ))  # fmt: skip
+    rows = []
+    for name, both in results.items():
+        value, gradient, estimate = zip(*both, strict=True)
+        rows += [row(name, "value", value, "Monte Carlo", estimate), row(name, "gradient", gradient)]
+    return rows
+
+
+def tabulated(brdf, dtype, **options):
+    axes = decomposition.optimized_directions(SHADING_DEGREE, dtype=dtype)
+    return shading.tabulate_brdf(brdf, decomposition.RotatedZonalBasis(axes, SHADING_DEGREE), **options)
+
+
+def polygon_truth(name, scene, slice_of):
+    """Radiance of the expansion and of the material by area quadrature, and derivatives of the former, with motions."""
+    points, position, normal, view = (np.asarray(x, np.longdouble) for x in scene)
+    coefficients = lambda frame, view: np.asarray(slice_of(jnp.asarray((frame @ view).astype(float))), float)
+
+    def integrals(points, position, normal):
+        outline = outline_above(points, position, frame_of(normal))
+        return 0 * _ZEROS if outline is None else -truth.edge_coefficients(outline, SHADING_DEGREE)
+
+    frame = frame_of(normal)
+    c, outline, value, of_material = coefficients(frame, view), outline_above(points, position, frame), 0.0, 0.0
+    if outline is not None:
+        w, area = truth.triangle_rule(outline, 40)
+        wo = (frame @ view).astype(float)
+        value = -area @ (truth.harmonics(w, SHADING_DEGREE)[0] @ c)
+        of_material = -area @ ggx_cosine(w.astype(float), wo / np.linalg.norm(wo), 0.5)
+    if "plane" in name:  # dark on one side: its derivatives
+        return value, of_material, [(i, np.ones_like(x), 0.0) for i, x in enumerate(scene)]
+
+    touching = "on the horizon" in name
+    step = 1e-7 if "1e-4" in name else 1e-4
+    slope = functools.partial(truth.derivative, forward=touching)
+    rng, tries = np.random.default_rng(6), []
+    b = integrals(points, position, normal)
+    for _ in range(2):
+        move = rng.normal(size=(4, 3))
+        lower = touching & (scene[0][:, 2] == 0)
+        move[lower, 2] = -np.abs(move[lower, 2])
+        tries.append((0, move, slope(lambda t, m=move: integrals(points + t * m, position, normal) @ c, step)))
+        move = rng.normal(size=3)
+        move[2] = np.abs(move[2]) if touching else move[2]
+        tries.append((1, move, slope(lambda t, m=move: integrals(points, position + t * m, normal) @ c, step)))
+        move = tangential(rng, normal)
+        if touching:
+            move = 0.3 * move - np.sum(scene[0][lower], axis=0)
+        turned = lambda t, m=move: frame_of(normal + t * m)
+        # the slice is known in float64 only: its part takes a longer step
+        change = slope(lambda t, m=move: integrals(points, position, normal + t * m) @ c, step)
+        change += truth.derivative(lambda t, turned=turned: b @ coefficients(turned(t), view), 1e-4)
+        tries.append((2, move, change))
+        move = tangential(rng, view)
+        tries.append((3, move, truth.derivative(lambda t, m=move: b @ coefficients(frame, view + t * m), 1e-4)))
+    return value, of_material, tries
+
+
+_ZEROS = np.zeros((SHADING_DEGREE + 1) ** 2, np.longdouble)
+
+
+def frame_of(normal):
+    """Any frame (rows) whose last axis is the normal."""
+    unit = lambda x: x / np.sqrt(np.sum(x * x))
+    normal = unit(normal)
+    x = unit(np.cross(normal, np.array([0.3, 0.5, -0.7], np.longdouble)))
+    return np.stack([x, np.cross(normal, x), normal])
+
+
+def outline_above(points, position, frame):
+    """Unit vertices of what is above the horizon, by plain clipping; None if nothing is, or from behind."""
+    emits = np.sum(np.cross(points - points[:1], np.roll(points, -1, 0) - points[:1]), axis=0)
+    if emits @ (position - points[0]) <= 0:
+        return None
+    local, kept = (points - position) @ frame.T, []
+    for a, b in zip(local, np.roll(local, -1, axis=0), strict=True):
+        kept += [a] if a[2] > 0 else []
+        kept += [a + (b - a) * (a[2] / (a[2] - b[2]))] if (a[2] > 0) != (b[2] > 0) else []
+    return np.stack([p / np.sqrt(p @ p) for p in kept]) if kept else None
+
+
+def ggx_cosine(wi, wo, alpha, xp=np):
+    """GGX of f0 = 0.04 times the cosine, as textbooks have it (Walter et al. 2007, Eq. 20, 33, 34); wi [..., 3]."""
+    half = wi + wo
+    half = half / xp.sqrt(xp.sum(half * half, axis=-1, keepdims=True))
+    cos_h, cos_i, cos_o = half[..., 2], wi[..., 2], wo[..., 2]
+    d = alpha**2 / (np.pi * (cos_h**2 * (alpha**2 - 1) + 1) ** 2)
+    g1 = lambda cosine: 2 / (1 + xp.sqrt(1 + alpha**2 * (1 - cosine**2) / cosine**2))
+    fresnel = 0.04 + 0.96 * (1 - xp.sum(half * wo, axis=-1)) ** 5
+    return xp.where((cos_i > 0) & (cos_o > 0), d * fresnel * g1(cos_i) * g1(cos_o) / (4 * cos_o), 0)
+
+
+# ---- shading by an environment
+
+
+def roughness_rows():
+    """The whole chain from roughness to radiance, against quadrature of the material."""
+    bands = np.array([1, 0.9, 0.7, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05])
+    pole, normal = unit([-0.4, 0.3, 0.7]), unit([0.1, -0.2, 1.0])
+    l = np.repeat(np.arange(9), 2 * np.arange(9) + 1)
+    e = bands[l] * 4 * np.pi / (2 * l + 1) * truth.scipy_basis(pole, SHADING_DEGREE)
+    light = lambda w: np.polynomial.legendre.legval(w @ pole, bands)
+    node = (28 + 0.5) * np.pi / 128
+    seen = lambda theta: frame_of(normal).T.astype(float) @ [np.sin(theta), 0.0, np.cos(theta)]
+    cases = {
+        "roughness 0.02 to radiance": (0.02, seen(node)),
+        "roughness 1 to radiance": (1.0, seen(node)),
+        "view 89.9 degrees from the normal, environment": (0.5, seen(np.radians(89.9))),
+        "view at the normal, environment": (0.5, normal),
+    }
+    results = {name: [] for name in cases}
+    exact = {name: environment_truth(alpha, normal, view, light) for name, (alpha, view) in cases.items()}
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64):
+
+            @jax.jit
+            @functools.partial(jax.value_and_grad, argnums=(0, 1, 2))
+            def radiance(alpha, normal, view, e):
+                return shading.shade_environment(tabulated(models.Ggx(alpha, 0.04), e.dtype), e, normal, view)
+
+            distant = models.Environment.from_function(
+                lambda w: jnp.asarray(light(np.asarray(w, float)), w.dtype), 256
+            )
+            for name, (alpha, view) in cases.items():
+                arguments = [jnp.asarray(x, dtype) for x in (alpha, normal, view, e)]
+                value, tries = exact[name]
+                run = lambda arguments=arguments: radiance(*arguments)
+                surface = [x[None] for x in arguments[1:3]]
+                brdf = models.Ggx(arguments[0], 0.04)
+                estimate = reference.shade_environment(brdf, distant, *surface, key=jax.random.key(1), samples=256)
+                results[name].append((
+                    attempt(lambda: largest(run()[0], value)),
+                    attempt(lambda: slope_error([np.asarray(s, float) for s in run()[1]], tries)),
+                    several([cell(largest(estimate.value[0], value))]),
+                ))  # fmt: skip
+    rows = []
+    for name, both in results.items():
+        value, gradient, estimate = zip(*both, strict=True)
+        rows += [row(name, "value", value, "Monte Carlo", estimate), row(name, "gradient", gradient)]
+    return rows
+
+
+def environment_truth(alpha, normal, view, light):
+    """Radiance, and its derivatives in alpha, normal and view, by a product rule over the hemisphere."""
+    count = 600 if alpha < 0.1 else 200
+    x, weights = np.polynomial.legendre.leggauss(count)
+    z, phi = (x + 1) / 2, (np.arange(2 * count) + 0.5) * np.pi / count
+    sine = np.sqrt(1 - z * z)[:, None]
+    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.broadcast_to(z[:, None], (count, len(phi)))], axis=-1)
+    wi, area = wi.reshape(-1, 3), np.repeat(weights / 2 * np.pi / count, len(phi))
+
+    def radiance(alpha, normal, view):
+        frame = frame_of(normal).astype(float)
+        wo = frame @ (view / np.sqrt(view @ view))
+        return np.sum(area * ggx_cosine(wi, wo, alpha) * light(wi @ frame))
+
+    rng, step = np.random.default_rng(8), 0.01 * min(alpha, 0.1)
+    tries = [(0, 1.0, truth.derivative(lambda t: radiance(alpha + t, normal, view), step))]
+    for argument in (1, 2):
+        move = tangential(rng, (normal, view)[argument - 1])
+        moved = (
+            (lambda t, m=move: radiance(alpha, normal + t * m, view)) if argument == 1
+            else (lambda t, m=move: radiance(alpha, normal, view + t * m))
+        )  # fmt: skip
+        tries.append((argument, move, truth.derivative(moved, min(step, 5e-4))))
+    return radiance(alpha, normal, view), tries
+
+
+# ---- materials
+
+
+def material_rows():
+    rows = []
+    for name, (alpha, wi, wo) in hard_cases.MATERIALS.items():
+        errors = precisions(functools.partial(material_errors, alpha, wi, wo))
+        for i, what in enumerate(("value", "gradient")):
+            rows.append(row(name, what, [e[0][i] for e in errors], "textbook", [several([e[1][i]]) for e in errors]))
+    return rows + measured_rows()
+
+
+def material_errors(alpha, wi, wo, dtype):
+    arguments = [jnp.asarray(x, dtype) for x in (alpha, wi, wo)]
+    exact, *slopes = material_truth(*(np.asarray(x, float) for x in arguments))
+    errors = []
+    for run in (_our_material, _textbook):
+        value, gradient = run(*arguments)
+        gradient = [np.array(g, float) for g in gradient]
+        for i in (1, 2):  # along the sphere
+            u = np.asarray(arguments[i], float)
+            gradient[i] -= (gradient[i] @ u) * u
+        # what a lobe of this width can change by
+        scale = max(abs(exact) / float(alpha), *(np.max(np.abs(s)) for s in slopes))
+        wrong = max(np.max(np.abs(g - s)) / scale for g, s in zip(gradient, slopes, strict=True))
+        errors.append((cell(abs(float(value) - exact) / abs(exact)), cell(wrong)))
+    return errors
+
+
+_our_material = jax.jit(
+    jax.value_and_grad(lambda alpha, wi, wo: models.Ggx(alpha, 0.04).value_cosine(wi, wo), (0, 1, 2))
+)
+_textbook = jax.jit(
+    jax.value_and_grad(lambda alpha, wi, wo: ggx_cosine(wi, wo, alpha, jnp).astype(wi.dtype), (0, 1, 2))
+)
+
+
+def material_truth(alpha, wi, wo):
+    """The textbook's formula in fifty digits: value, and derivatives in alpha and along the sphere in wi and wo."""
+    with mpmath.workdps(50):
+        vector = lambda x: mpmath.matrix([mpmath.mpf(float(v)) for v in x])
+        unit = lambda x: x / mpmath.norm(x)
+
+        def value(alpha, wi, wo):
+            wi, wo = unit(wi), unit(wo)
+            half = unit(wi + wo)
+            d = alpha**2 / (mpmath.pi * (half[2] ** 2 * (alpha**2 - 1) + 1) ** 2)
+            g1 = lambda c: 2 / (1 + mpmath.sqrt(1 + alpha**2 * (1 - c**2) / c**2))
+            cosine = sum(half[i] * wo[i] for i in range(3))
+            fresnel = mpmath.mpf("0.04") + mpmath.mpf("0.96") * (1 - cosine) ** 5
+            return d * fresnel * g1(wi[2]) * g1(wo[2]) / (4 * wo[2])
+
+        a, wi, wo, h = mpmath.mpf(float(alpha)), vector(wi), vector(wo), mpmath.mpf("1e-15")
+        slope = lambda f: float((f(h) - f(-h)) / (2 * h))
+        steps = [vector(s) for s in np.eye(3)]
+        return (
+            float(value(a, wi, wo)),
+            slope(lambda t: value(a + t, wi, wo)),
+            np.array([slope(lambda t, s=s: value(a, wi + t * s, wo)) for s in steps]),
+            np.array([slope(lambda t, s=s: value(a, wi, wo + t * s)) for s in steps]),
+        )
+
+
+def measured_rows():
+    """A file of GGX with a fifth of the bins negative, and those below the horizon, against GGX itself."""
+    rng, alpha = np.random.default_rng(9), 0.3
+    directions = rng.normal(size=(2, 200, 3)) * [1, 1, 0.5] + [0, 0, 1.2]
+    wi, wo = unit(np.abs(directions) * [1, 1, 1])
+    wi[:, :2] *= rng.choice([-1, 1], (200, 2))
+    exact = ggx_cosine(wi, wo, alpha)
+    move = np.stack([tangential(rng, w) for w in wi])
+    slopes = (
+        lambda t: ggx_cosine((wi + t * move) / np.linalg.norm(wi + t * move, axis=1, keepdims=True), wo, alpha)
+    )
+    slopes = truth.derivative(slopes, 1e-3)
+    rms = lambda got, expected: np.sqrt(np.mean((np.asarray(got, float) - expected) ** 2) / np.mean(expected**2))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "holes.binary"
+        io.write_merl(path, models.Ggx(alpha, 0.04))
+        planes = np.fromfile(path, "<f8", offset=12).reshape(3, -1)
+        planes[:, rng.random(planes.shape[1]) < 0.2] = -0.3
+        with path.open("r+b") as file:
+            file.seek(12)
+            planes.tofile(file)
+
+        def errors(dtype):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                brdf = models.MeasuredBrdf.from_merl(path, dtype=dtype)
+            f = lambda wi, wo: brdf.value_cosine(wi, wo)[0]
+            value, gradient = jax.jit(jax.vmap(jax.value_and_grad(f)))(*(jnp.asarray(w, dtype) for w in (wi, wo)))
+            published = nearest_bin(planes[0].reshape(90, 90, 180) / 1500, wi, wo) * wi[:, 2]
+            return (
+                cell(rms(value, exact)),
+                cell(rms(np.sum(np.asarray(gradient, float) * move, axis=1), slopes)),
+                several([cell(rms(published, exact))]),
+                attempt(lambda: models.MeasuredBrdf.from_merl(path, negative="refuse")),
+            )
+
+        value, gradient, published, refused = zip(*precisions(errors), strict=True)
+    name = "measured bins negative or below the horizon"
+    return [
+        row(name, "value", value, "nearest bin", published),
+        row(name, "gradient", gradient),
+        row(f"{name}, refused on request", "value", refused),
+    ]
+
+
+def nearest_bin(plane, wi, wo):
+    """The table's bins as they are, at half and difference angles (Rusinkiewicz 1998), as published with the data."""
+    half = unit(wi + wo)
+    theta_h, phi_h = np.arccos(np.clip(half[:, 2], -1, 1)), np.arctan2(half[:, 1], half[:, 0])
+    cos, sin = np.cos(phi_h), np.sin(phi_h)
+    x, y, z = cos * wi[:, 0] + sin * wi[:, 1], cos * wi[:, 1] - sin * wi[:, 0], wi[:, 2]
+    x, z = np.cos(theta_h) * x - np.sin(theta_h) * z, np.sin(theta_h) * x + np.cos(theta_h) * z
+    theta_d, phi_d = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x) % np.pi
+    at = (90 * np.sqrt(theta_h / (np.pi / 2)), 90 * theta_d / (np.pi / 2), 180 * phi_d / np.pi)
+    return plane[tuple(np.clip(i.astype(int), 0, n - 1) for i, n in zip(at, plane.shape, strict=True))]
+
+
+# ---- distant light
+
+
+def light_rows():
+    rng = np.random.default_rng(11)
+    normals = unit(rng.normal(size=(8, 3)))
+    views = unit(normals + 0.6 * unit(rng.normal(size=(8, 3))))
+    mix, motion = rng.normal(size=8), [rng.normal(size=(16, 32)), tangential(rng, normals), tangential(rng, views)]
+    brdf = models.Ggx(0.5, 0.04)
+    clean = np.nan_to_num(hard_cases.BAD_TEXELS, nan=0.0, posinf=20.0)
+    maps = hard_cases.LIGHTS | {"NaN and infinite texels, from a file": clean}
+    with jax.enable_x64(True):
+        slice_of = jax.jit(jax.vmap(tabulated(brdf, np.float64).slice_coefficients))
+        exact = {}
+        for name, texels in maps.items():
+            e, local = map_coefficients(texels), lambda e, n, v: environment_radiance(slice_of, e, n, v)
+            along = [
+                mix @ local(map_coefficients(motion[0]), normals, views),
+                truth.derivative(lambda t, e=e, local=local: mix @ local(e, normals + t * motion[1], views), 1e-4),
+                truth.derivative(lambda t, e=e, local=local: mix @ local(e, normals, views + t * motion[2]), 1e-4),
+            ]
+            quadrature = reference.shade_environment_quadrature(
+                brdf, models.Environment(texels), normals, views, supersampling=8
+            )
+            exact[name] = local(e, normals, views), along, np.asarray(quadrature)
+    results = {name: [] for name in maps}
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64), tempfile.TemporaryDirectory() as folder:
+            lobes, weights = tabulated(brdf, dtype), jnp.asarray(mix, dtype)
+
+            @jax.jit
+            @functools.partial(jax.grad, argnums=(0, 1, 2), has_aux=True)
+            def shade(texels, normals, views, lobes=lobes, weights=weights):
+                light = models.Environment(texels).coefficients(SHADING_DEGREE)
+                radiance = shading.shade_environment(lobes, light, normals, views)
+                return weights @ radiance, radiance
+
+            surface = [jnp.asarray(x, dtype) for x in (normals, views)]
+            for name, texels in maps.items():
+                texels = jnp.asarray(texels, dtype)
+                if "file" in name:
+                    path = Path(folder) / "bad.exr"
+                    write_exr(path, hard_cases.BAD_TEXELS)
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore", UserWarning)
+                        texels = models.Environment.load(path, dtype=dtype).texels[..., 0]
+                    refused = attempt(lambda path=path: models.Environment.load(path, bad_texels="refuse"))
+                    results.setdefault("NaN and infinite texels, refused on request", []).append((refused, None, "-"))
+                slopes, got = shade(texels, *surface)
+                value, along, by_quadrature = exact[name]
+                size = np.sqrt(np.mean(value**2)) or 1.0
+                estimate = reference.shade_environment(
+                    brdf, models.Environment(texels), *surface, key=jax.random.key(2), samples=256
+                ).value
+                moved = [np.sum(np.asarray(s, float) * m) for s, m in zip(slopes, motion, strict=True)]
+                wrong = [abs(m - a) / max(abs(a), size if i else 0) for i, (m, a) in enumerate(zip(moved, along, strict=True))]
+                scale = np.sqrt(np.mean(by_quadrature**2)) or 1.0
+                results[name].append((
+                    cell(np.max(np.abs(np.asarray(got, float) - value)) / size),
+                    cell(np.max(wrong)),
+                    several([cell(np.max(np.abs(np.asarray(estimate, float) - by_quadrature)) / scale)]),
+                ))  # fmt: skip
+            slopes, got = shade(jnp.asarray(hard_cases.BAD_TEXELS, dtype), *surface)
+            results.setdefault("NaN and infinite texels, as they are", []).append(
+                (cell(np.max(np.asarray(got))), cell(np.max(np.asarray(slopes[1]))), "-")
+            )
+    rows = []
+    for name, both in results.items():
+        value, gradient, estimate = zip(*both, strict=True)
+        rows.append(row(name, "value", value, "-" if estimate[0] == "-" else "Monte Carlo", estimate))
+        if gradient[0] is not None:
+            rows.append(row(name, "gradient", gradient))
+    return rows
+
+
+def map_coefficients(texels):
+    """Coefficients of a map: trigonometric interpolation in the polar angle, then a product rule."""
+    height, width = texels.shape
+    around = np.concatenate([texels, np.roll(texels[::-1], width // 2, axis=1)])  # over the pole and back
+    at = np.pi * (np.arange(2 * height) + 0.5) / height
+    x, weights = np.polynomial.legendre.leggauss(64)
+    theta, phi = np.pi / 2 * (x + 1), 2 * np.pi * (np.arange(width) + 0.5) / width
+    k = np.arange(1, height)
+    step = theta[:, None] - at
+    kernel = 1 + 2 * np.cos(step[..., None] * k).sum(axis=-1) + np.cos(height * step)
+    values = kernel @ around / (2 * height)
+    area = (weights * np.pi / 2 * np.sin(theta) * 2 * np.pi / width)[:, None]
+    sine, cosine = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    w = np.stack(np.broadcast_arrays(sine * np.cos(phi), sine * np.sin(phi), cosine), axis=-1)
+    return (values * area).reshape(-1) @ truth.scipy_basis(w.reshape(-1, 3), SHADING_DEGREE)
+
+
+def environment_radiance(slice_of, e, normals, views):
+    """Integrals of slice times light, by a product rule that is exact."""
+    x, weights = np.polynomial.legendre.leggauss(SHADING_DEGREE + 2)
+    phi = 2 * np.pi * np.arange(2 * SHADING_DEGREE + 2) / (2 * SHADING_DEGREE + 2)
+    sine, cosine = np.sqrt(1 - x * x)[:, None], x[:, None]
+    w = np.stack(np.broadcast_arrays(sine * np.cos(phi), sine * np.sin(phi), cosine), axis=-1).reshape(-1, 3)
+    area = np.repeat(weights * 2 * np.pi / len(phi), len(phi))
+    frames = np.stack([frame_of(n) for n in normals]).astype(float)
+    slices = np.asarray(slice_of(jnp.asarray(np.einsum("pij,pj->pi", frames, np.asarray(views, float)))))
+    lobe = slices @ truth.scipy_basis(w, SHADING_DEGREE).T
+    light = truth.scipy_basis(np.einsum("qi,pij->pqj", w, frames), SHADING_DEGREE) @ e
+    return np.sum(area * lobe * light, axis=1)
+
+
+def write_exr(path, texels):
+    import OpenEXR
+
+    channels = {name: texels.astype(np.float32) for name in "RGB"}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
