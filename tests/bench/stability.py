@@ -378,7 +378,8 @@ def tabulated(brdf, dtype, **options):
 def polygon_truth(name, scene, slice_of):
     """Radiance of the expansion and of the material by area quadrature, and derivatives of the former, with motions."""
     points, position, normal, view = (np.asarray(x, np.longdouble) for x in scene)
-    coefficients = lambda frame, view: np.asarray(slice_of(jnp.asarray((frame @ view).astype(float))), float)
+    seen = lambda frame, view: (frame @ view / np.sqrt(view @ view)).astype(float)
+    coefficients = lambda frame, view: np.asarray(slice_of(jnp.asarray(seen(frame, view))), float)
 
     def integrals(points, position, normal):
         outline = outline_above(points, position, frame_of(normal))
@@ -388,9 +389,8 @@ def polygon_truth(name, scene, slice_of):
     c, outline, value, of_material = coefficients(frame, view), outline_above(points, position, frame), 0.0, 0.0
     if outline is not None:
         w, area = truth.triangle_rule(outline, 40)
-        wo = (frame @ view).astype(float)
         value = -area @ (truth.harmonics(w, SHADING_DEGREE)[0] @ c)
-        of_material = -area @ ggx_cosine(w.astype(float), wo / np.linalg.norm(wo), 0.5)
+        of_material = -area @ ggx_cosine(w.astype(float), seen(frame, view), 0.5)
     if "plane" in name:  # dark on one side: its derivatives
         return value, of_material, [(i, np.ones_like(x), 0.0) for i, x in enumerate(scene)]
 
