@@ -124,10 +124,10 @@ SHADING = {
     "light wholly below the horizon": ([[1, -0.5, -0.75], [1, -0.5, -0.25], [1, 0.5, -0.25], [1, 0.5, -0.5]], _ORIGIN, _UP, _ASIDE),
     "point in the light's plane": ([[1, 0, 0.25], [2, 0, 0.25], [2, 0, 1], [1, 0, 1.5]], _ORIGIN, _UP, _ASIDE),
     "point 1e-4 away from the light": (_LIGHT_NEAR, _ORIGIN, _UP, _ASIDE),
-    "clockwise winding, seen from behind": (_LIGHT[::-1], _ORIGIN, _UP, _ASIDE),
+    "clockwise light, seen from behind": (_LIGHT[::-1], _ORIGIN, _UP, _ASIDE),
     "non-convex light": (_DENTED, _ORIGIN, _UP, _ASIDE),
-    "view 89.9 degrees from the normal": (_WALL, _ORIGIN, _UP, [np.sin(np.radians(89.9)), 0.0, np.cos(np.radians(89.9))]),
-    "view at the normal": (_WALL, _ORIGIN, _UP, _UP),
+    "view 89.9 degrees from the normal, light beside the lobe": (_WALL, _ORIGIN, _UP, [np.sin(np.radians(89.9)), 0.0, np.cos(np.radians(89.9))]),
+    "view at the normal, polygon": (_WALL, _ORIGIN, _UP, _UP),
     "view at a normal off the axes": (_WALL, _ORIGIN, [-0.25, 0.125, 1.0], [-0.25, 0.125, 1.0]),
 }  # fmt: skip
 
