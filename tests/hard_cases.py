@@ -1,4 +1,4 @@
-"""Input on which formulas fail: directions, sets of axes, polygons, scenes, materials and lights, one list for every test.
+"""Input on which formulas fail, one list for every test: directions, axes, polygons, scenes, materials, lights.
 
 Every case that has a name here is a row of tests/bench/stability.py.
 """
@@ -117,19 +117,21 @@ _LIGHT_NEAR = [[-0.5, -0.5, 1e-4], [-0.5, 0.5, 1e-4], [0.5, 0.5, 1e-4], [0.5, -0
 _DENTED = [[-0.5, -0.5, 1.0], [0, -0.25, 1.0], [-0.5, 0.5, 1.0], [0.5, -0.5, 1.0]]
 _UP, _ORIGIN, _ASIDE = [0.0, 0, 1], [0.0, 0, 0], [0.375, -0.25, 0.625]
 _WALL = [[1, -0.5, 0.25], [1, -0.5, 1], [1, 0.75, 0.75], [1, 0.75, 0.5]]  # faces the origin
+_SCENE = _ORIGIN, _UP, _ASIDE
+_GRAZING = [np.sin(np.radians(89.9)), 0.0, np.cos(np.radians(89.9))]
 SHADING = {
-    "light straddling the horizon": ([[1, -0.5, -0.75], [1, -0.5, 0.75], [1, 0.5, 1], [1, 0.75, -0.5]], _ORIGIN, _UP, _ASIDE),
-    "light with an edge on the horizon": ([[1, -0.5, 0], [1.25, -0.5, 0.75], [1.125, 0.5, 1], [1, 0.5, 0]], _ORIGIN, _UP, _ASIDE),
-    "light with a corner on the horizon": ([[1, 0, 0], [1.25, -0.5, 0.75], [1.125, 0.25, 1], [1, 0.5, 0.25]], _ORIGIN, _UP, _ASIDE),
-    "light wholly below the horizon": ([[1, -0.5, -0.75], [1, -0.5, -0.25], [1, 0.5, -0.25], [1, 0.5, -0.5]], _ORIGIN, _UP, _ASIDE),
-    "point in the light's plane": ([[1, 0, 0.25], [2, 0, 0.25], [2, 0, 1], [1, 0, 1.5]], _ORIGIN, _UP, _ASIDE),
-    "point 1e-4 away from the light": (_LIGHT_NEAR, _ORIGIN, _UP, _ASIDE),
-    "clockwise light, seen from behind": (_LIGHT[::-1], _ORIGIN, _UP, _ASIDE),
-    "non-convex light": (_DENTED, _ORIGIN, _UP, _ASIDE),
-    "view 89.9 degrees from the normal, light beside the lobe": (_WALL, _ORIGIN, _UP, [np.sin(np.radians(89.9)), 0.0, np.cos(np.radians(89.9))]),
+    "light straddling the horizon": ([[1, -0.5, -0.75], [1, -0.5, 0.75], [1, 0.5, 1], [1, 0.75, -0.5]], *_SCENE),
+    "light with an edge on the horizon": ([[1, -0.5, 0], [1.25, -0.5, 0.75], [1.125, 0.5, 1], [1, 0.5, 0]], *_SCENE),
+    "light with a corner on the horizon": ([[1, 0, 0], [1.25, -0.5, 0.75], [1.125, 0.25, 1], [1, 0.5, 0.25]], *_SCENE),
+    "light wholly below the horizon": ([[1, -0.5, -0.75], [1, -0.5, -0.25], [1, 0.5, -0.25], [1, 0.5, -0.5]], *_SCENE),
+    "point in the light's plane": ([[1, 0, 0.25], [2, 0, 0.25], [2, 0, 1], [1, 0, 1.5]], *_SCENE),
+    "point 1e-4 away from the light": (_LIGHT_NEAR, *_SCENE),
+    "clockwise light, seen from behind": (_LIGHT[::-1], *_SCENE),
+    "non-convex light": (_DENTED, *_SCENE),
+    "view 89.9 degrees from the normal, light beside the lobe": (_WALL, _ORIGIN, _UP, _GRAZING),
     "view at the normal, polygon": (_WALL, _ORIGIN, _UP, _UP),
     "view at a normal off the axes": (_WALL, _ORIGIN, [-0.25, 0.125, 1.0], [-0.25, 0.125, 1.0]),
-}  # fmt: skip
+}
 
 
 # ---- materials: alpha of GGX (0.02^2 is what a metallic-roughness material of roughness 0.02 has), and directions

@@ -201,15 +201,15 @@ def axes_rows():
     results = {}
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64):
-            arguments = [jnp.asarray(x, dtype) for x in (c, w)]
+            arguments, weights = [jnp.asarray(x, dtype) for x in (c, w)], jnp.asarray(mix, dtype)
             values = [jax.jit(f) for f in methods]
-            slopes = [jax.jit(jax.grad(lambda z, c, w, f=f: jnp.asarray(mix, dtype) @ f(z, c, w))) for f in methods]
+            slopes = [jax.jit(jax.grad(lambda z, c, w, v, f=f: v @ f(z, c, w))) for f in methods]
             for case, z in hard_cases.axis_sets(AXES_DEGREE).items():
                 z = jnp.asarray(z, dtype)
-                value = lambda f, z=z: np.max(np.abs(np.asarray(f(z, *arguments), float) - expected)) / rms
-                slope = lambda f, z=z: np.max(np.abs(np.asarray(f(z, *arguments), float))) / rms  # 0 is right
-                for what, functions, error in (("value", values, value), ("gradient", slopes, slope)):
-                    cells = [attempt(lambda f=f, error=error: error(f)) for f in functions]
+                kinds = ("value", values, (z, *arguments), expected), ("gradient", slopes, (z, *arguments, weights), 0)
+                for what, functions, a, right in kinds:
+                    error = lambda f, a=a, right=right: np.max(np.abs(np.asarray(f(*a), float) - right)) / rms
+                    cells = [attempt(functools.partial(error, f)) for f in functions]
                     results.setdefault((case, what), []).append((cells[0], several(cells[1:])))
     return [row(*name, [r[0] for r in both], "solve / pinv", [r[1] for r in both]) for name, both in results.items()]
 
@@ -499,13 +499,13 @@ def roughness_rows():
             for name, (alpha, view) in cases.items():
                 arguments = [jnp.asarray(x, dtype) for x in (alpha, normal, view, e)]
                 value, tries = exact[name]
-                run = lambda arguments=arguments: radiance(*arguments)
                 surface = [x[None] for x in arguments[1:3]]
                 brdf = models.Ggx(arguments[0], 0.04)
                 estimate = reference.shade_environment(brdf, distant, *surface, key=jax.random.key(1), samples=256)
+                got, slopes = radiance(*arguments)
                 results[name].append((
-                    attempt(lambda: largest(run()[0], value)),
-                    attempt(lambda: slope_error([np.asarray(s, float) for s in run()[1]], tries, value)),
+                    cell(largest(got, value)),
+                    cell(slope_error([np.asarray(s, float) for s in slopes], tries, value)),
                     several([cell(largest(estimate.value[0], value))]),
                 ))  # fmt: skip
     rows = []
