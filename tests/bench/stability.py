@@ -56,10 +56,10 @@ def cell(error) -> float | str:
     return error if isinstance(error, str) else float(error) if np.isfinite(error) else "NaN"
 
 
-def attempt(error: Callable) -> float | str:
-    """An error, or that there is a message instead."""
+def attempt(function: Callable, *arguments):
+    """What it returns, or that there is a message instead."""
     try:
-        return cell(error())
+        return function(*arguments)
     except (ValueError, RuntimeError):
         return "refused"
 
@@ -131,9 +131,8 @@ def band_error(got, expected):
 
 @functools.partial(jax.jit, static_argnums=1)
 def our_basis(d, degree):
-    values = harmonics.sh_basis(d, degree)
-    push = lambda step: jax.jvp(lambda x: harmonics.sh_basis(x, degree), (d,), (jnp.broadcast_to(step, d.shape),))[1]
-    return values, jnp.moveaxis(jax.vmap(push)(jnp.eye(3, dtype=d.dtype)), 0, -1)
+    push = lambda step: jax.jvp(lambda x: harmonics.sh_basis(x, degree), (d,), (jnp.broadcast_to(step, d.shape),))
+    return jax.vmap(push, out_axes=(None, -1))(jnp.eye(3, dtype=d.dtype))
 
 
 def unsigned(degree):
@@ -184,7 +183,6 @@ def axes_rows():
     c[band] = rng.normal(size=2 * AXES_DEGREE + 1)
     w, mix = unit(rng.normal(size=(12, 3))), unit(rng.normal(size=12))
     expected = truth.scipy_basis(w, AXES_DEGREE) @ c
-    rms = np.sqrt(np.mean(expected**2))
 
     def ours(z, c, w):
         basis = decomposition.RotatedZonalBasis(z, AXES_DEGREE)
@@ -201,17 +199,22 @@ def axes_rows():
     results = {}
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64):
-            arguments, weights = [jnp.asarray(x, dtype) for x in (c, w)], jnp.asarray(mix, dtype)
-            values = [jax.jit(f) for f in methods]
-            slopes = [jax.jit(jax.grad(lambda z, c, w, v, f=f: v @ f(z, c, w))) for f in methods]
+            arguments = [jnp.asarray(x, dtype) for x in (c, w, mix)]
+            along = lambda f: lambda z, c, w, mix: (mix @ f(z, c, w), f(z, c, w))
+            compiled = [jax.jit(jax.grad(along(f), has_aux=True)) for f in methods]
             for case, z in hard_cases.axis_sets(AXES_DEGREE).items():
-                z = jnp.asarray(z, dtype)
-                kinds = ("value", values, (z, *arguments), expected), ("gradient", slopes, (z, *arguments, weights), 0)
-                for what, functions, a, right in kinds:
-                    error = lambda f, a=a, right=right: np.max(np.abs(np.asarray(f(*a), float) - right)) / rms
-                    cells = [attempt(functools.partial(error, f)) for f in functions]
-                    results.setdefault((case, what), []).append((cells[0], several(cells[1:])))
+                cells = [attempt(axes_errors, f, expected, jnp.asarray(z, dtype), *arguments) for f in compiled]
+                for i, what in enumerate(("value", "gradient")):
+                    of_each = [x if isinstance(x, str) else x[i] for x in cells]
+                    results.setdefault((case, what), []).append((of_each[0], several(of_each[1:])))
     return [row(*name, [r[0] for r in both], "solve / pinv", [r[1] for r in both]) for name, both in results.items()]
+
+
+def axes_errors(function, expected, *arguments):
+    """Of the values, and of derivatives in the axes, which should be 0."""
+    slopes, values = function(*arguments)
+    rms = np.sqrt(np.mean(expected**2))
+    return cell(np.max(np.abs(np.asarray(values, float) - expected)) / rms), cell(np.max(np.abs(slopes)) / rms)
 
 
 # ---- polygons
@@ -635,7 +638,7 @@ def measured_rows():
                 cell(rms(value, exact)),
                 cell(rms(np.sum(np.asarray(gradient, float) * move, axis=1), slopes)),
                 several([cell(rms(published, exact))]),
-                attempt(lambda: models.MeasuredBrdf.from_merl(path, negative="refuse")),
+                attempt(functools.partial(models.MeasuredBrdf.from_merl, path, negative="refuse")),
             )
 
         value, gradient, published, refused = zip(*precisions(errors), strict=True)
@@ -705,7 +708,7 @@ def light_rows():
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", UserWarning)
                         texels = models.Environment.load(path, dtype=dtype).texels[..., 0]
-                    refused = attempt(lambda path=path: models.Environment.load(path, bad_texels="refuse"))
+                    refused = attempt(functools.partial(models.Environment.load, path, bad_texels="refuse"))
                     results.setdefault("NaN and infinite texels, refused on request", []).append((refused, None, "-"))
                 slopes, got = shade(texels, *surface)
                 value, along, by_quadrature = exact[name]
