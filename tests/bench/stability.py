@@ -200,14 +200,18 @@ def axes_rows():
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64):
             arguments = [jnp.asarray(x, dtype) for x in (c, w, mix)]
-            along = lambda f: lambda z, c, w, mix: (mix @ f(z, c, w), f(z, c, w))
-            compiled = [jax.jit(jax.grad(along(f), has_aux=True)) for f in methods]
+            compiled = [jax.jit(jax.grad(functools.partial(weighted, f), has_aux=True)) for f in methods]
             for case, z in hard_cases.axis_sets(AXES_DEGREE).items():
                 cells = [attempt(axes_errors, f, expected, jnp.asarray(z, dtype), *arguments) for f in compiled]
                 for i, what in enumerate(("value", "gradient")):
                     of_each = [x if isinstance(x, str) else x[i] for x in cells]
                     results.setdefault((case, what), []).append((of_each[0], several(of_each[1:])))
     return [row(*name, [r[0] for r in both], "solve / pinv", [r[1] for r in both]) for name, both in results.items()]
+
+
+def weighted(function, z, c, w, mix):
+    values = function(z, c, w)
+    return mix @ values, values
 
 
 def axes_errors(function, expected, *arguments):
