@@ -45,7 +45,7 @@ SHADING = {  # the same, for rows of shading; float32 limits follow from what is
     "light with a corner on the horizon": (1e-4, 1e-9, 2e-2, 1e-9),
     "point 1e-4 away from the light": (1e-4, 1e-9, 1e-2, 1e-8),
     "non-convex light": (1e-4, 1e-9, 2e-2, 1e-9),
-    "view 89.9 degrees from the normal, light beside the lobe": (2e-2, 1e-9, 1.0, 1e-8),
+    "view 89.9 degrees from the normal, light beside the lobe": (1e-2, 1e-9, 1.0, 1e-9),
     # interpolation in the view leaves a conical point of this size at the normal
     "view at the normal, polygon": (1e-4, 1e-9, 1e-1, 1e-6),
     "view at a normal off the axes": (1e-4, 1e-9, 1e-1, 1e-6),
@@ -53,7 +53,7 @@ SHADING = {  # the same, for rows of shading; float32 limits follow from what is
     "roughness 0.02 to radiance": (1e-4, 1e-6, 1e-3, 1e-4),
     "roughness 1 to radiance": (1e-4, 1e-9, 1e-3, 1e-6),
     "view 89.9 degrees from the normal, environment": (1e-3, 1e-3, 1e-2, 1e-2),
-    "view at the normal, environment": (1e-4, 1e-7, 1e-3, 1e-6),
+    "view at the normal, environment": (1e-5, 1e-7, 1e-4, 1e-6),
     # linear between bins, a fifth of them filled from their neighbours
     "measured bins negative or below the horizon": (1e-2, 1e-2, 1e-1, 1e-1),
     # the slopes of slices across the table of views, in float32

@@ -408,7 +408,7 @@ def polygon_truth(name, scene, slice_of):
     frame = frame_of(normal)
     c, outline, value, of_material = coefficients(frame, view), outline_above(points, position, frame), 0.0, 0.0
     if outline is not None:
-        w, area = truth.triangle_rule(outline, 40)
+        w, area = truth.triangle_rule(outline, 32)
         value = -area @ (truth.harmonics(w, SHADING_DEGREE)[0] @ c)
         of_material = -area @ ggx_cosine(w.astype(float), seen(frame, view), 0.5)
     if "plane" in name:  # dark on one side: its derivatives
