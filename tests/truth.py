@@ -53,3 +53,81 @@ def zonal_moments(vertices, axes, degree, nodes):
         moments.append(area @ p)
         before, p = p, ((2 * l + 1) * x * p - l * before) / (l + 1)
     return np.stack(moments, axis=-1).astype(float)
+
+
+def harmonics(directions, degree):
+    """Real harmonics [N, n] of unit vectors along `directions`, and their derivatives along the sphere [N, n, 3].
+
+    The normalised recurrence in degree (ISD15s Eq. 3-5) and its derivative, Cartesian, in extended precision: y_l^m is
+    a polynomial in z times the real or imaginary part of (x + i y)^m, so poles are ordinary points.
+    """
+    u = np.asarray(directions, np.longdouble)
+    u = u / np.max(np.abs(u), axis=-1, keepdims=True)
+    u = u / np.sqrt(np.sum(u * u, axis=-1, keepdims=True))
+    x, y, z = u.T
+    m = np.arange(degree + 1)
+    power = [np.ones_like(x), np.zeros_like(x)]
+    cos, sin = [power[0]], [power[1]]
+    for _ in range(degree):
+        power = [power[0] * x - power[1] * y, power[0] * y + power[1] * x]
+        cos.append(power[0])
+        sin.append(power[1])
+    cos, sin = np.stack(cos), np.stack(sin)  # [m, N]
+    less = lambda wave: m[:, None] * np.concatenate([0 * wave[:1], wave[:-1]])  # m (x + i y)^(m-1)
+    q = np.zeros((3, degree + 1, len(x)), np.longdouble)  # degrees l-2, l-1, l
+    dq = np.zeros_like(q)
+    values = np.zeros(((degree + 1) ** 2, len(x)), np.longdouble)
+    slopes = np.zeros((3, *values.shape), np.longdouble)
+    for l in range(degree + 1):
+        k = m[:l].astype(np.longdouble)[:, None]
+        q, dq = np.roll(q, -1, axis=0), np.roll(dq, -1, axis=0)
+        a, b = np.sqrt((4 * l * l - 1) / (l * l - k * k)), np.sqrt(((l - 1) ** 2 - k * k) / abs(4 * (l - 1) ** 2 - 1))
+        q[2, :l] = a * (z * q[1, :l] - b * q[0, :l])
+        dq[2, :l] = a * (q[1, :l] + z * dq[1, :l] - b * dq[0, :l])
+        one = np.longdouble(1)
+        q[2, l] = -np.sqrt((2 * l + one) / (2 * l)) * q[1, l - 1] if l else 1 / np.sqrt(4 * np.arctan2(one, 0) * 2)
+        dq[2, l] = 0
+        scale = np.where(np.arange(l + 1) > 0, np.sqrt(2 * one), one)[:, None]
+        for sign, wave, wave_x, wave_y in ((1, cos, less(cos), -less(sin)), (-1, sin, less(sin), less(cos))):
+            at = l * l + l + sign * m[: l + 1]
+            at, take = (at, slice(0, l + 1)) if sign > 0 else (at[1:], slice(1, l + 1))
+            p, dp = scale[take] * q[2, take], scale[take] * dq[2, take]
+            values[at] = p * wave[take]
+            slopes[:, at] = p * wave_x[take], p * wave_y[take], dp * wave[take]
+    slopes = np.moveaxis(slopes, 0, -1)
+    slopes = slopes - np.sum(slopes * u, axis=-1, keepdims=True) * u
+    return values.T, np.swapaxes(slopes, 0, 1)
+
+
+def edge_coefficients(vertices, degree, nodes=16, halvings=2):
+    """Integrals [n] of the harmonics over a polygon [S, 3] from lines along its edges, in extended precision.
+
+    y_lm is -1/(l(l+1)) times its Laplacian, so its integral is that of n . grad y_lm along the edges over l(l+1), taken
+    on chords p(t) = a + t (b - a) of parts of the edges, with n ds = (a x b) dt / |p|^2. For l = 0, a fan of triangles.
+    """
+    unit = lambda p: p / np.sqrt(np.sum(p * p, axis=-1, keepdims=True))
+    v = unit(np.asarray(vertices, np.longdouble))
+    a, b, c = v[:1], v[1:-1], v[2:]
+    volume, along = np.sum(a * np.cross(b - a, c - a), axis=-1), 1 + np.sum(a * b + b * c + c * a, axis=-1)
+    solid_angle = 2 * np.sum(np.arctan2(volume, along))
+    for _ in range(halvings):
+        v = np.stack([v, unit(v + np.roll(v, -1, axis=0))], axis=1).reshape(-1, 3)
+    end = np.roll(v, -1, axis=0)
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    p = v[:, None] + ((x + 1) / 2)[:, None] * (end - v)[:, None]
+    line = np.cross(v, end - v)[:, None] * (w / 2)[:, None] / np.sum(p * p, axis=-1, keepdims=True)
+    _, slopes = harmonics(p.reshape(-1, 3), degree)
+    l = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+    integrals = np.einsum("pni,pi->n", slopes, line.reshape(-1, 3)) / np.maximum(l * (l + 1), 1)
+    integrals[0] = solid_angle / np.sqrt(4 * np.arctan2(np.longdouble(1), 0) * 2)
+    return integrals
+
+
+_CENTRAL = {-3: -1 / 60, -2: 3 / 20, -1: -3 / 4, 1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+_FORWARD = {0: -49 / 20, 1: 6, 2: -15 / 2, 3: 20 / 3, 4: -15 / 4, 5: 6 / 5, 6: -1 / 6}
+
+
+def derivative(function, step, *, forward=False):
+    """The derivative of function(t) at 0, in extended precision: differences of sixth order, central or forward."""
+    rule = _FORWARD if forward else _CENTRAL
+    return sum(np.longdouble(weight) * function(k * step) for k, weight in rule.items()) / np.longdouble(step)

@@ -259,7 +259,7 @@ def _nodes(
     where psi_max changes over an angle cos(theta_o).
     """
     cos_o = view[2]
-    sin_o = jnp.sqrt(1 - cos_o * cos_o)
+    sin_o = jnp.sqrt(view[0] ** 2 + view[1] ** 2)
     x, y = view[0] / sin_o, view[1] / sin_o
     mirror = jnp.stack([-view[0], -view[1], cos_o])
     up, side = jnp.stack([x * cos_o, y * cos_o, sin_o]), jnp.stack([-y, x, jnp.zeros_like(x)])

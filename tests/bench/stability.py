@@ -1,0 +1,781 @@
+"""Errors where formulas fail: every case of tests/hard_cases.py, in both precisions, beside what others do there.
+
+Truth is in extended precision or in mpmath and shares no formula with the package: harmonics by their recurrence,
+polygons by area quadrature, materials by their textbook formulas, derivatives by differences of sixth order.
+"""
+
+import functools
+import importlib.util
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import sphericart
+from scipy.special import sph_harm_y_all
+
+from shisd import decomposition, domains, harmonics, io, models, reference, shading
+from tests import hard_cases, truth
+from tests.bench import polygons
+from tests.hard_cases import padded, unit
+
+FLOATS = (np.float32, np.float64)
+AXES_DEGREE, POLYGON_DEGREE, SHADING_DEGREE = 8, 16, 8
+
+
+def bench_stability():
+    """Errors where formulas fail, of ours and of others, relative to the natural size; NaN and refusals by name.
+
+    Natural size: the largest value of the band (harmonics), the RMS of the expansion (axes), the solid angle
+    (polygons), the radiance (shading; its RMS over eight points for lights) or the value itself (materials, over the
+    width of the lobe for their derivatives). Derivatives otherwise: the largest of those tried in an argument, or the
+    radiance per rad and unit of length if that is larger; along the sphere where an argument is a direction; where an
+    outline touches the horizon, on the side on which it is cut off; in the plane of a light, as from behind it.
+    Polygons: degree 16; axes and shading: degree 8, GGX of alpha 0.5. Shading by polygons and the lights are compared
+    with quadrature of the same expansion, the rows from roughness to radiance and the measured bins with the material
+    itself; Monte Carlo (256 samples) always with the material itself.
+    """
+    groups = (harmonics_rows, axes_rows, polygon_rows, shading_rows, roughness_rows, material_rows, light_rows)
+    return [row for group in groups for row in group()]
+
+
+def row(case: str, what: str, ours: list, peer: str = "-", theirs: list | None = None) -> dict:
+    theirs = theirs or ["-", "-"]
+    return {
+        "case": case, "what": what, "ours float32": ours[0], "ours float64": ours[1],
+        "peer": peer, "peer float32": theirs[0], "peer float64": theirs[1],
+    }  # fmt: skip
+
+
+def cell(error) -> float | str:
+    return error if isinstance(error, str) else float(error) if np.isfinite(error) else "NaN"
+
+
+def attempt(function: Callable, *arguments):
+    """What it returns, or that there is a message instead."""
+    try:
+        return function(*arguments)
+    except (ValueError, RuntimeError):
+        return "refused"
+
+
+def several(cells: list) -> str:
+    """Cells of several peers as one."""
+    return " / ".join(x if isinstance(x, str) else f"{x:.0e}" for x in cells)
+
+
+def precisions(function: Callable) -> list:
+    """function(dtype) in float32 and in float64."""
+    results = []
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64):
+            results.append(function(dtype))
+    return results
+
+
+def largest(got, expected) -> float:
+    """The largest error, relative to the largest expected value; absolute where that is zero."""
+    got, expected = np.asarray(got, float), np.asarray(expected, float)
+    return np.max(np.abs(got - expected)) / (np.max(np.abs(expected)) or 1.0)
+
+
+# ---- harmonics
+
+
+def harmonics_rows():
+    rows = []
+    for case, (directions, degree) in hard_cases.HARMONICS.items():
+        peers = {"sphericart": sphericart_basis, "SciPy": scipy_basis}
+        if degree <= 8 and importlib.util.find_spec("e3nn_jax"):
+            peers["e3nn-jax"] = e3nn_basis
+        methods = [our_basis, *peers.values()]
+        errors = precisions(functools.partial(basis_errors, directions, degree, methods))
+        for i, what in enumerate(("value", "gradient")):
+            ours = [cell(e[0][i]) for e in errors]
+            theirs = [several([cell(x[i]) for x in e[1:]]) for e in errors]
+            rows.append(row(case, what, ours, " / ".join(peers), theirs))
+    return rows
+
+
+def basis_errors(directions, degree, methods, dtype):
+    if degree > 100 and dtype == np.float32:  # its compilation would take longer than that of all others
+        return [["-", "-"]] * len(methods)
+    d = np.resize(directions, (12, 3)).astype(dtype)  # one shape for all
+    with np.errstate(all="ignore"):
+        expected = truth.harmonics(d, degree)
+        length = np.sqrt(np.sum(d.astype(np.longdouble) ** 2, axis=1))[:, None, None]
+    errors = []
+    for method in methods:
+        with np.errstate(all="ignore"):
+            values, slopes = method(d, degree)
+            got = values, np.asarray(slopes, np.longdouble) * length
+            errors.append([band_error(g, e) for g, e in zip(got, expected, strict=True)])
+    return errors
+
+
+def band_error(got, expected):
+    """Relative to the largest value of each band."""
+    errors = []
+    for l in range(int(np.sqrt(expected.shape[1]))):
+        band = slice(l * l, (l + 1) ** 2)
+        errors.append(
+            np.max(np.abs(np.asarray(got, float) - expected)[:, band]) / (np.max(abs(expected[:, band])) or 1)
+        )
+    return np.max(errors)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def our_basis(d, degree):
+    push = lambda step: jax.jvp(lambda x: harmonics.sh_basis(x, degree), (d,), (jnp.broadcast_to(step, d.shape),))
+    return jax.vmap(push, out_axes=(None, -1))(jnp.eye(3, dtype=d.dtype))
+
+
+def unsigned(degree):
+    """From the basis without the sign (-1)^m to ours."""
+    return np.concatenate([(-1.0) ** np.arange(-l, l + 1) for l in range(degree + 1)])
+
+
+def sphericart_basis(d, degree):
+    values, slopes = sphericart.SphericalHarmonics(degree).compute_with_gradients(d)
+    return values * unsigned(degree), np.moveaxis(slopes, 1, 2) * unsigned(degree)[:, None]
+
+
+def scipy_basis(d, degree):
+    """In the precision of `d`, with the derivatives in both angles that SciPy offers."""
+    length = np.sqrt(np.sum(d.astype(np.longdouble) ** 2, axis=1))[:, None, None]
+    d = d / np.max(np.abs(d), axis=1, keepdims=True)
+    d = d / np.sqrt(np.sum(d * d, axis=1, keepdims=True))
+    theta, phi = np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
+    l = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+    m = (np.arange(len(l)) - l * l - l)[:, None]
+    y, dy = (x[l, np.abs(m[:, 0])] for x in sph_harm_y_all(degree, degree, theta, phi, diff_n=1))
+    real = lambda y: np.where(m == 0, y.real, np.sqrt(d.dtype.type(2)) * np.where(m > 0, y.real, y.imag)).T
+    south = np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)], axis=-1)
+    east = np.stack([-np.sin(phi), np.cos(phi), 0 * phi], axis=-1)
+    by_theta, by_phi = real(dy[..., 0]), real(dy[..., 1]) / np.sin(theta)[:, None]
+    return real(y), (by_theta[..., None] * south[:, None] + by_phi[..., None] * east[:, None]) / length
+
+
+def e3nn_basis(d, degree):
+    """Its polar axis is the second."""
+    import e3nn_jax
+
+    irreps = e3nn_jax.Irreps.spherical_harmonics(degree)
+    basis = lambda x: e3nn_jax.spherical_harmonics(irreps, x, True, normalization="integral").array
+    x = jnp.asarray(d[:, [1, 2, 0]])
+    slopes = jax.vmap(jax.jacfwd(basis))(x)
+    return np.asarray(basis(x)) * unsigned(degree), np.asarray(slopes)[..., [2, 0, 1]] * unsigned(degree)[:, None]
+
+
+# ---- axes
+
+
+def axes_rows():
+    """An expansion in the highest band, decomposed and evaluated: whatever the axes, it must come back."""
+    rng = np.random.default_rng(2)
+    band = slice(AXES_DEGREE**2, (AXES_DEGREE + 1) ** 2)
+    c = np.zeros(band.stop)
+    c[band] = rng.normal(size=2 * AXES_DEGREE + 1)
+    w, mix = unit(rng.normal(size=(12, 3))), unit(rng.normal(size=12))
+    expected = truth.scipy_basis(w, AXES_DEGREE) @ c
+
+    def ours(z, c, w):
+        basis = decomposition.RotatedZonalBasis(z, AXES_DEGREE)
+        return basis.evaluate(basis.weights(c), w)
+
+    def peer(solve, z, c, w):
+        m = harmonics.sh_basis(z, AXES_DEGREE)[:, band].T * np.sqrt(4 * np.pi / (2 * AXES_DEGREE + 1)).item()
+        return harmonics.sh_basis(w, AXES_DEGREE)[:, band] @ (m @ solve(m, c[band]))
+
+    square = lambda m, c: jnp.concatenate(
+        [jnp.linalg.solve(m[:, : len(c)], c), jnp.zeros(m.shape[1] - len(c), c.dtype)]
+    )
+    methods = [ours, functools.partial(peer, square), functools.partial(peer, lambda m, c: jnp.linalg.pinv(m) @ c)]
+    results = {}
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64):
+            arguments = [jnp.asarray(x, dtype) for x in (c, w, mix)]
+            compiled = [jax.jit(jax.grad(functools.partial(weighted, f), has_aux=True)) for f in methods]
+            for case, z in hard_cases.axis_sets(AXES_DEGREE).items():
+                cells = [attempt(axes_errors, f, expected, jnp.asarray(z, dtype), *arguments) for f in compiled]
+                for i, what in enumerate(("value", "gradient")):
+                    of_each = [x if isinstance(x, str) else x[i] for x in cells]
+                    results.setdefault((case, what), []).append((of_each[0], several(of_each[1:])))
+    return [row(*name, [r[0] for r in both], "solve / pinv", [r[1] for r in both]) for name, both in results.items()]
+
+
+def weighted(function, z, c, w, mix):
+    values = function(z, c, w)
+    return mix @ values, values
+
+
+def axes_errors(function, expected, *arguments):
+    """Of the values, and of derivatives in the axes, which should be 0."""
+    slopes, values = function(*arguments)
+    rms = np.sqrt(np.mean(expected**2))
+    return cell(np.max(np.abs(np.asarray(values, float) - expected)) / rms), cell(np.max(np.abs(slopes)) / rms)
+
+
+# ---- polygons
+
+
+def polygon_rows():
+    cases = {name: (v, hard_cases.axes_for(v, np.random.default_rng(1))) for name, v in hard_cases.POLYGONS.items()}
+    beyond = hard_cases.BEYOND_A_HEMISPHERE
+    cases["more than a hemisphere"] = beyond, hard_cases.axes_for(beyond, np.random.default_rng(1))
+    cases |= {name: (v, np.tile(d, (9, 1))) for name, (v, d) in hard_cases.AXES_AT_POLYGONS.items()}
+    errors = precisions(functools.partial(polygon_errors, cases))
+    rows = []
+    for name in cases:
+        value, gradient = zip(*(e[name] for e in errors), strict=True)
+        rows.append(
+            row(name, "value", [x[0] for x in value], "cosine powers / plain recurrence", [x[1] for x in value])
+        )
+        rows.append(row(name, "gradient", [x[0] for x in gradient], "plain recurrence", [x[1] for x in gradient]))
+    opposite = hard_cases.OPPOSITE_VERTICES
+    refused = precisions(
+        lambda dtype: attempt(lambda: domains.solid_angle(domains.SphericalPolygon(opposite.astype(dtype))))
+    )
+    return [*rows, row("an edge of exactly pi", "value", refused)]
+
+
+def polygon_errors(cases, dtype):
+    weights = np.cos(np.arange(9 * (POLYGON_DEGREE + 1))).reshape(9, -1)
+    ours = lambda v, d: domains.zonal_moments(domains.SphericalPolygon(v), d, POLYGON_DEGREE)
+    loss = lambda f: lambda v, d: (jnp.sum(f(v, d) * jnp.asarray(weights, dtype)), f(v, d))
+    compiled = lambda f: jax.jit(jax.vmap(jax.grad(loss(f), (0, 1), has_aux=True)))
+    v = np.stack([padded(v) for v, _ in cases.values()]).astype(dtype)
+    d = np.stack([d for _, d in cases.values()]).astype(dtype)
+    wide = np.array([name == "more than a hemisphere" for name in cases])
+    slopes, got = (jax.tree.map(np.array, x) for x in compiled(ours)(v, d))
+    got[wide, :, 0] = domains.solid_angle(
+        domains.SphericalPolygon(v[wide][0], largest=4 * np.pi)
+    )  # `largest` is static
+    plain_slopes, plain = (jax.tree.map(np.array, x) for x in compiled(plain_moments)(v, d))
+    powers = np.stack([
+        polygons.zonal_from_axial(polygons.axial_moments(p[None], axes, POLYGON_DEGREE, dtype))[0]
+        for p, axes in zip(v, d, strict=True)
+    ])  # fmt: skip
+    for moments in (powers, plain):
+        moments[wide, :, 0] += np.where(moments[wide, :, 0] < 0, 4 * np.pi, 0)
+    errors = {}
+    for i, (name, (vertices, _)) in enumerate(cases.items()):
+        p = v[i, : len(vertices)]
+        exact = truth.zonal_moments(p[::-1] if wide[i] else p, d[i], POLYGON_DEGREE, 33)
+        exact = 4 * np.pi * np.eye(POLYGON_DEGREE + 1)[0] - exact if wide[i] else exact
+        value = lambda x, exact=exact: cell(np.max(np.abs(np.asarray(x, float) - exact)) / abs(exact[0, 0]))
+        along = polygon_derivatives(p, d[i], weights, np.sqrt(abs(exact[0, 0])))
+        gradient = lambda x, along=along: cell(slope_error(x, along))
+        take = lambda x, i=i: [np.asarray(a[i], float) for a in x]
+        with np.errstate(all="ignore"):
+            errors[name] = (
+                (value(got[i]), several([value(powers[i]), value(plain[i])])),
+                (gradient(take(slopes)), gradient(take(plain_slopes))),
+            )
+    return errors
+
+
+def polygon_derivatives(vertices, axes, weights, size):
+    """Of the weighted sum of moments, along two motions of the vertices and two of the axes."""
+    l = np.arange(POLYGON_DEGREE + 1)
+    bands = np.repeat(l, 2 * l + 1)
+    scale = weights * 4 * np.pi / (2 * l + 1)
+
+    def total(integrals, y):
+        return np.sum((y * integrals) @ (bands[:, None] == l) * scale)
+
+    v, d = np.asarray(vertices, np.longdouble), np.asarray(axes, np.longdouble)
+    y, integrals = truth.harmonics(d, POLYGON_DEGREE)[0], truth.edge_coefficients(v, POLYGON_DEGREE)
+    rng, step, tries = np.random.default_rng(4), 1e-4 * min(1.0, float(size)), []
+    for _ in range(2):
+        move = tangential(rng, v)
+        moved = lambda t, move=move: total(truth.edge_coefficients(v + t * move, POLYGON_DEGREE), y)
+        # padding repeats the first vertex, which moves with it
+        tries.append((0, padded(move), truth.derivative(moved, step)))
+        move = tangential(rng, d)
+        turned = lambda t, move=move: total(integrals, truth.harmonics(d + t * move, POLYGON_DEGREE)[0])
+        tries.append((1, move, truth.derivative(turned, 1e-4)))
+    return tries
+
+
+def tangential(rng, directions):
+    """Random motions along the sphere."""
+    u = np.asarray(directions, float)
+    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
+    move = rng.normal(size=u.shape)
+    return move - np.sum(move * u, axis=-1, keepdims=True) * u
+
+
+def slope_error(gradients, tries, size=0.0):
+    """The largest error over the arguments, relative to each one's largest derivative or to `size`, if that is larger.
+
+    tries: (argument, motion, derivative).
+    """
+    errors = []
+    for argument in {t[0] for t in tries}:
+        pairs = [(np.sum(gradients[argument] * move), slope) for a, move, slope in tries if a == argument]
+        got, expected = np.array(pairs, float).T
+        errors.append(np.max(np.abs(got - expected)) / (max(np.max(np.abs(expected)), size) or 1.0))
+    return np.max(errors)
+
+
+def plain_moments(v, axes):
+    """The recurrence along edges as it stands, in Legendre polynomials, without differences; a fan for l = 0."""
+    b = jnp.roll(v, -1, axis=0)
+    cross = jnp.cross(v, b)
+    sine = jnp.linalg.norm(cross, axis=1)
+    normal = jnp.where(sine[:, None] > 0, cross / sine[:, None], 0)
+    angle = jnp.arctan2(sine, jnp.sum(v * b, axis=1))[:, None]
+    u0, u1, g, s0 = v @ axes.T, b @ axes.T, normal @ axes.T, jnp.cross(normal, v) @ axes.T
+    s1 = s0 * jnp.cos(angle) - u0 * jnp.sin(angle)
+    first, middle, last = v[:1], v[1:-1], v[2:]
+    volume = jnp.sum(first * jnp.cross(middle[: len(last)], last), axis=1)
+    along = 1 + jnp.sum(first * middle[: len(last)] + middle[: len(last)] * last + last * first, axis=1)
+
+    def step(state, l):
+        p0, q0, p1, q1, e0, e1, d0, d1 = state  # P_l and P_{l-1} at the ends, E_{l-1}, E_l, D_{l-1}, D_l
+        moment = jnp.sum(g * d1, axis=0) / (l * (l + 1))
+        c = (s0 * p0 - s1 * p1 - g * g * d1 + l * e0) / (l + 1)
+        p0, q0, p1, q1 = (
+            ((2 * l + 1) * u0 * p0 - l * q0) / (l + 1), p0, ((2 * l + 1) * u1 * p1 - l * q1) / (l + 1), p1
+        )  # fmt: skip
+        return (p0, q0, p1, q1, e1, ((2 * l + 1) * c - l * e0) / (l + 1), d1, d0 + (2 * l + 1) * e1), moment
+
+    one, zero, angle = jnp.ones_like(u0), jnp.zeros_like(u0), jnp.broadcast_to(angle, u0.shape)
+    start = (u0, one, u1, one, angle, s0 - s1, zero, angle)
+    _, rest = jax.lax.scan(step, start, jnp.arange(1, POLYGON_DEGREE + 1, dtype=v.dtype))
+    moments = jnp.broadcast_to(2 * jnp.sum(jnp.arctan2(volume, along)), (1, len(axes)))
+    return jnp.concatenate([moments, rest]).T
+
+
+# ---- shading by polygons
+
+
+def shading_rows():
+    scenes = {name: [np.float32(x) for x in scene] for name, scene in hard_cases.SHADING.items()}
+    results = {}
+    brdf = models.Ggx(0.5, 0.04)
+    with jax.enable_x64(True):
+        exact_slice = eqx.filter_jit(tabulated(brdf, np.float64, domain="upper").slice_coefficients)
+        expected = {name: polygon_truth(name, scene, exact_slice) for name, scene in scenes.items()}
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64):
+            lobes = tabulated(brdf, dtype, domain="upper")
+            shade = lambda points, *surface, lobes=lobes: shading.shade_polygon(
+                lobes, models.PolygonLight(points), *surface
+            )
+            stacked = [jnp.asarray(np.stack(x), dtype) for x in zip(*scenes.values(), strict=True)]
+            got, slopes = jax.jit(jax.vmap(jax.value_and_grad(shade, (0, 1, 2, 3))))(*stacked)
+            slopes = [np.asarray(s, float) for s in slopes]
+            for i, name in enumerate(scenes):
+                points, *surface = (x[i] for x in stacked)
+                estimate = reference.shade_polygon(
+                    brdf, points, 1.0, *(x[None] for x in surface), key=jax.random.key(0), samples=256
+                ).value[0]
+                value, of_material, tries = expected[name]
+                results.setdefault(name, []).append((
+                    cell(largest(got[i], value)),
+                    cell(slope_error([s[i] for s in slopes], tries, float(value))),
+                    several([cell(largest(estimate, of_material))]),
+                ))  # fmt: skip
+    rows = []
+    for name, both in results.items():
+        value, gradient, estimate = zip(*both, strict=True)
+        rows += [row(name, "value", value, "Monte Carlo", estimate), row(name, "gradient", gradient)]
+    return rows
+
+
+def tabulated(brdf, dtype, **options):
+    axes = decomposition.optimized_directions(SHADING_DEGREE, dtype=dtype)
+    return shading.tabulate_brdf(brdf, decomposition.RotatedZonalBasis(axes, SHADING_DEGREE), **options)
+
+
+def polygon_truth(name, scene, slice_of):
+    """Radiance of the expansion and of the material by area quadrature, and derivatives of the former, with motions."""
+    points, position, normal, view = (np.asarray(x, np.longdouble) for x in scene)
+    seen = lambda frame, view: (frame @ view / np.sqrt(view @ view)).astype(float)
+    coefficients = lambda frame, view: np.asarray(slice_of(jnp.asarray(seen(frame, view))), float)
+
+    def integrals(points, position, normal):
+        outline = outline_above(points, position, frame_of(normal))
+        return 0 * _ZEROS if outline is None else -truth.edge_coefficients(outline, SHADING_DEGREE)
+
+    frame = frame_of(normal)
+    c, outline, value, of_material = coefficients(frame, view), outline_above(points, position, frame), 0.0, 0.0
+    if outline is not None:
+        w, area = truth.triangle_rule(outline, 32)
+        value = -area @ (truth.harmonics(w, SHADING_DEGREE)[0] @ c)
+        of_material = -area @ ggx_cosine(w.astype(float), seen(frame, view), 0.5)
+    if "plane" in name:  # dark on one side: its derivatives
+        return value, of_material, [(i, np.ones_like(x), 0.0) for i, x in enumerate(scene)]
+
+    touching = "on the horizon" in name
+    step = 1e-7 if "1e-4" in name else 1e-4
+    slope = functools.partial(truth.derivative, forward=touching)
+    rng, tries = np.random.default_rng(6), []
+    b = integrals(points, position, normal)
+    for _ in range(2):
+        move = rng.normal(size=(4, 3))
+        lower = touching & (scene[0][:, 2] == 0)
+        move[lower, 2] = -np.abs(move[lower, 2])
+        tries.append((0, move, slope(lambda t, m=move: integrals(points + t * m, position, normal) @ c, step)))
+        move = rng.normal(size=3)
+        move[2] = np.abs(move[2]) if touching else move[2]
+        tries.append((1, move, slope(lambda t, m=move: integrals(points, position + t * m, normal) @ c, step)))
+        move = tangential(rng, normal)
+        if touching:
+            move = 0.3 * move - np.sum(scene[0][lower], axis=0)
+        turned = lambda t, m=move: frame_of(normal + t * m)
+        # the slice is known in float64 only: its part takes a longer step
+        change = slope(lambda t, m=move: integrals(points, position, normal + t * m) @ c, step)
+        change += truth.derivative(lambda t, turned=turned: b @ coefficients(turned(t), view), 1e-4)
+        tries.append((2, move, change))
+        move = tangential(rng, view)
+        tries.append((3, move, truth.derivative(lambda t, m=move: b @ coefficients(frame, view + t * m), 1e-4)))
+    return value, of_material, tries
+
+
+_ZEROS = np.zeros((SHADING_DEGREE + 1) ** 2, np.longdouble)
+
+
+def frame_of(normal):
+    """Any frame (rows) whose last axis is the normal."""
+    unit = lambda x: x / np.sqrt(np.sum(x * x))
+    normal = unit(normal)
+    x = unit(np.cross(normal, np.array([0.3, 0.5, -0.7], np.longdouble)))
+    return np.stack([x, np.cross(normal, x), normal])
+
+
+def outline_above(points, position, frame):
+    """Unit vertices of what is above the horizon, by plain clipping; None if nothing is, or from behind."""
+    emits = np.sum(np.cross(points - points[:1], np.roll(points, -1, 0) - points[:1]), axis=0)
+    if emits @ (position - points[0]) <= 0:
+        return None
+    local, kept = (points - position) @ frame.T, []
+    for a, b in zip(local, np.roll(local, -1, axis=0), strict=True):
+        kept += [a] if a[2] > 0 else []
+        kept += [a + (b - a) * (a[2] / (a[2] - b[2]))] if (a[2] > 0) != (b[2] > 0) else []
+    return np.stack([p / np.sqrt(p @ p) for p in kept]) if kept else None
+
+
+def ggx_cosine(wi, wo, alpha, xp=np):
+    """GGX of f0 = 0.04 times the cosine, as textbooks have it (Walter et al. 2007, Eq. 20, 33, 34); wi [..., 3]."""
+    half = wi + wo
+    half = half / xp.sqrt(xp.sum(half * half, axis=-1, keepdims=True))
+    cos_h, cos_i, cos_o = half[..., 2], wi[..., 2], wo[..., 2]
+    d = alpha**2 / (np.pi * (cos_h**2 * (alpha**2 - 1) + 1) ** 2)
+    g1 = lambda cosine: 2 / (1 + xp.sqrt(1 + alpha**2 * (1 - cosine**2) / cosine**2))
+    fresnel = 0.04 + 0.96 * (1 - xp.sum(half * wo, axis=-1)) ** 5
+    return xp.where((cos_i > 0) & (cos_o > 0), d * fresnel * g1(cos_i) * g1(cos_o) / (4 * cos_o), 0)
+
+
+# ---- shading by an environment
+
+
+def roughness_rows():
+    """The whole chain from roughness to radiance, against quadrature of the material."""
+    bands = np.array([1, 0.9, 0.7, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05])
+    pole, normal = unit([-0.4, 0.3, 0.7]), unit([0.1, -0.2, 1.0])
+    l = np.repeat(np.arange(9), 2 * np.arange(9) + 1)
+    e = bands[l] * 4 * np.pi / (2 * l + 1) * truth.scipy_basis(pole, SHADING_DEGREE)
+    light = lambda w: np.polynomial.legendre.legval(w @ pole, bands)
+    node = (28 + 0.5) * np.pi / 128
+    seen = lambda theta: frame_of(normal).T.astype(float) @ [np.sin(theta), 0.0, np.cos(theta)]
+    cases = {
+        "roughness 0.02 to radiance": (0.02, seen(node)),
+        "roughness 1 to radiance": (1.0, seen(node)),
+        "view 89.9 degrees from the normal, environment": (0.5, seen(np.radians(89.9))),
+        "view at the normal, environment": (0.5, normal),
+    }
+    results = {name: [] for name in cases}
+    exact = {name: environment_truth(alpha, normal, view, light) for name, (alpha, view) in cases.items()}
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64):
+
+            @jax.jit
+            @functools.partial(jax.value_and_grad, argnums=(0, 1, 2))
+            def radiance(alpha, normal, view, e):
+                return shading.shade_environment(tabulated(models.Ggx(alpha, 0.04), e.dtype), e, normal, view)
+
+            distant = models.Environment.from_function(lambda w: jnp.asarray(light(np.asarray(w, float)), w.dtype), 256)
+            for name, (alpha, view) in cases.items():
+                arguments = [jnp.asarray(x, dtype) for x in (alpha, normal, view, e)]
+                value, tries = exact[name]
+                surface = [x[None] for x in arguments[1:3]]
+                brdf = models.Ggx(arguments[0], 0.04)
+                estimate = reference.shade_environment(brdf, distant, *surface, key=jax.random.key(1), samples=256)
+                got, slopes = radiance(*arguments)
+                results[name].append((
+                    cell(largest(got, value)),
+                    cell(slope_error([np.asarray(s, float) for s in slopes], tries, value)),
+                    several([cell(largest(estimate.value[0], value))]),
+                ))  # fmt: skip
+    rows = []
+    for name, both in results.items():
+        value, gradient, estimate = zip(*both, strict=True)
+        rows += [row(name, "value", value, "Monte Carlo", estimate), row(name, "gradient", gradient)]
+    return rows
+
+
+def environment_truth(alpha, normal, view, light):
+    """Radiance, and its derivatives in alpha, normal and view, by a product rule over the hemisphere."""
+    count = 600 if alpha < 0.1 else 200
+    x, weights = np.polynomial.legendre.leggauss(count)
+    z, phi = (x + 1) / 2, (np.arange(2 * count) + 0.5) * np.pi / count
+    sine = np.sqrt(1 - z * z)[:, None]
+    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.broadcast_to(z[:, None], (count, len(phi)))], axis=-1)
+    wi, area = wi.reshape(-1, 3), np.repeat(weights / 2 * np.pi / count, len(phi))
+
+    def radiance(alpha, normal, view):
+        frame = frame_of(normal).astype(float)
+        wo = frame @ (view / np.sqrt(view @ view))
+        return np.sum(area * ggx_cosine(wi, wo, alpha) * light(wi @ frame))
+
+    rng, step = np.random.default_rng(8), 0.01 * min(alpha, 0.1)
+    tries = [(0, 1.0, truth.derivative(lambda t: radiance(alpha + t, normal, view), step))]
+    for argument in (1, 2):
+        move = tangential(rng, (normal, view)[argument - 1])
+        moved = (
+            (lambda t, m=move: radiance(alpha, normal + t * m, view)) if argument == 1
+            else (lambda t, m=move: radiance(alpha, normal, view + t * m))
+        )  # fmt: skip
+        tries.append((argument, move, truth.derivative(moved, min(step, 5e-4))))
+    return radiance(alpha, normal, view), tries
+
+
+# ---- materials
+
+
+def material_rows():
+    rows = []
+    for name, (alpha, wi, wo) in hard_cases.MATERIALS.items():
+        errors = precisions(functools.partial(material_errors, alpha, wi, wo))
+        for i, what in enumerate(("value", "gradient")):
+            rows.append(row(name, what, [e[0][i] for e in errors], "textbook", [several([e[1][i]]) for e in errors]))
+    return rows + measured_rows()
+
+
+def material_errors(alpha, wi, wo, dtype):
+    arguments = [jnp.asarray(x, dtype) for x in (alpha, wi, wo)]
+    exact, *slopes = material_truth(*(np.asarray(x, float) for x in arguments))
+    errors = []
+    for run in (_our_material, _textbook):
+        value, gradient = run(*arguments)
+        gradient = [np.array(g, float) for g in gradient]
+        for i in (1, 2):  # along the sphere
+            u = np.asarray(arguments[i], float)
+            gradient[i] -= (gradient[i] @ u) * u
+        # what a lobe of this width can change by
+        scale = max(abs(exact) / float(alpha), *(np.max(np.abs(s)) for s in slopes))
+        wrong = max(np.max(np.abs(g - s)) / scale for g, s in zip(gradient, slopes, strict=True))
+        errors.append((cell(abs(float(value) - exact) / abs(exact)), cell(wrong)))
+    return errors
+
+
+_our_material = jax.jit(
+    jax.value_and_grad(lambda alpha, wi, wo: models.Ggx(alpha, 0.04).value_cosine(wi, wo), (0, 1, 2))
+)
+_textbook = jax.jit(
+    jax.value_and_grad(lambda alpha, wi, wo: ggx_cosine(wi, wo, alpha, jnp).astype(wi.dtype), (0, 1, 2))
+)
+
+
+def material_truth(alpha, wi, wo):
+    """The textbook's formula in fifty digits: value, and derivatives in alpha and along the sphere in wi and wo."""
+    with mpmath.workdps(50):
+        vector = lambda x: mpmath.matrix([mpmath.mpf(float(v)) for v in x])
+        unit = lambda x: x / mpmath.norm(x)
+
+        def value(alpha, wi, wo):
+            wi, wo = unit(wi), unit(wo)
+            half = unit(wi + wo)
+            d = alpha**2 / (mpmath.pi * (half[2] ** 2 * (alpha**2 - 1) + 1) ** 2)
+            g1 = lambda c: 2 / (1 + mpmath.sqrt(1 + alpha**2 * (1 - c**2) / c**2))
+            cosine = sum(half[i] * wo[i] for i in range(3))
+            fresnel = mpmath.mpf("0.04") + mpmath.mpf("0.96") * (1 - cosine) ** 5
+            return d * fresnel * g1(wi[2]) * g1(wo[2]) / (4 * wo[2])
+
+        a, wi, wo, h = mpmath.mpf(float(alpha)), vector(wi), vector(wo), mpmath.mpf("1e-15")
+        slope = lambda f: float((f(h) - f(-h)) / (2 * h))
+        steps = [vector(s) for s in np.eye(3)]
+        return (
+            float(value(a, wi, wo)),
+            slope(lambda t: value(a + t, wi, wo)),
+            np.array([slope(lambda t, s=s: value(a, wi + t * s, wo)) for s in steps]),
+            np.array([slope(lambda t, s=s: value(a, wi, wo + t * s)) for s in steps]),
+        )
+
+
+def measured_rows():
+    """A file of GGX with a fifth of the bins negative, and those below the horizon, against GGX itself."""
+    rng, alpha = np.random.default_rng(9), 0.3
+    directions = rng.normal(size=(2, 200, 3)) * [1, 1, 0.5] + [0, 0, 1.2]
+    wi, wo = unit(np.abs(directions) * [1, 1, 1])
+    wi[:, :2] *= rng.choice([-1, 1], (200, 2))
+    exact = ggx_cosine(wi, wo, alpha)
+    move = np.stack([tangential(rng, w) for w in wi])
+    slopes = lambda t: ggx_cosine((wi + t * move) / np.linalg.norm(wi + t * move, axis=1, keepdims=True), wo, alpha)
+    slopes = truth.derivative(slopes, 1e-3)
+    rms = lambda got, expected: np.sqrt(np.mean((np.asarray(got, float) - expected) ** 2) / np.mean(expected**2))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "holes.binary"
+        io.write_merl(path, models.Ggx(alpha, 0.04))
+        planes = np.fromfile(path, "<f8", offset=12).reshape(3, -1)
+        planes[:, rng.random(planes.shape[1]) < 0.2] = -0.3
+        with path.open("r+b") as file:
+            file.seek(12)
+            planes.tofile(file)
+
+        def errors(dtype):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                brdf = models.MeasuredBrdf.from_merl(path, dtype=dtype)
+            f = lambda wi, wo: brdf.value_cosine(wi, wo)[0]
+            value, gradient = jax.jit(jax.vmap(jax.value_and_grad(f)))(*(jnp.asarray(w, dtype) for w in (wi, wo)))
+            published = nearest_bin(planes[0].reshape(90, 90, 180) / 1500, wi, wo) * wi[:, 2]
+            return (
+                cell(rms(value, exact)),
+                cell(rms(np.sum(np.asarray(gradient, float) * move, axis=1), slopes)),
+                several([cell(rms(published, exact))]),
+                attempt(functools.partial(models.MeasuredBrdf.from_merl, path, negative="refuse")),
+            )
+
+        value, gradient, published, refused = zip(*precisions(errors), strict=True)
+    name = "measured bins negative or below the horizon"
+    return [
+        row(name, "value", value, "nearest bin", published),
+        row(name, "gradient", gradient),
+        row(f"{name}, refused on request", "value", refused),
+    ]
+
+
+def nearest_bin(plane, wi, wo):
+    """The table's bins as they are, at half and difference angles (Rusinkiewicz 1998), as published with the data."""
+    half = unit(wi + wo)
+    theta_h, phi_h = np.arccos(np.clip(half[:, 2], -1, 1)), np.arctan2(half[:, 1], half[:, 0])
+    cos, sin = np.cos(phi_h), np.sin(phi_h)
+    x, y, z = cos * wi[:, 0] + sin * wi[:, 1], cos * wi[:, 1] - sin * wi[:, 0], wi[:, 2]
+    x, z = np.cos(theta_h) * x - np.sin(theta_h) * z, np.sin(theta_h) * x + np.cos(theta_h) * z
+    theta_d, phi_d = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x) % np.pi
+    at = (90 * np.sqrt(theta_h / (np.pi / 2)), 90 * theta_d / (np.pi / 2), 180 * phi_d / np.pi)
+    return plane[tuple(np.clip(i.astype(int), 0, n - 1) for i, n in zip(at, plane.shape, strict=True))]
+
+
+# ---- distant light
+
+
+def light_rows():
+    rng = np.random.default_rng(11)
+    normals = unit(rng.normal(size=(8, 3)))
+    views = unit(normals + 0.6 * unit(rng.normal(size=(8, 3))))
+    mix, motion = rng.normal(size=8), [rng.normal(size=(16, 32)), tangential(rng, normals), tangential(rng, views)]
+    brdf = models.Ggx(0.5, 0.04)
+    clean = np.nan_to_num(hard_cases.BAD_TEXELS, nan=0.0, posinf=20.0)
+    maps = hard_cases.LIGHTS | {"NaN and infinite texels, from a file": clean}
+    with jax.enable_x64(True):
+        slice_of = jax.jit(jax.vmap(tabulated(brdf, np.float64).slice_coefficients))
+        exact = {}
+        for name, texels in maps.items():
+            e, local = map_coefficients(texels), lambda e, n, v: environment_radiance(slice_of, e, n, v)
+            along = [
+                mix @ local(map_coefficients(motion[0]), normals, views),
+                truth.derivative(lambda t, e=e, local=local: mix @ local(e, normals + t * motion[1], views), 1e-4),
+                truth.derivative(lambda t, e=e, local=local: mix @ local(e, normals, views + t * motion[2]), 1e-4),
+            ]
+            quadrature = reference.shade_environment_quadrature(
+                brdf, models.Environment(texels), normals, views, supersampling=8
+            )
+            exact[name] = local(e, normals, views), along, np.asarray(quadrature)
+    results = {name: [] for name in maps}
+    for dtype in FLOATS:
+        with jax.enable_x64(dtype == np.float64), tempfile.TemporaryDirectory() as folder:
+            lobes, weights = tabulated(brdf, dtype), jnp.asarray(mix, dtype)
+
+            @jax.jit
+            @functools.partial(jax.grad, argnums=(0, 1, 2), has_aux=True)
+            def shade(texels, normals, views, lobes=lobes, weights=weights):
+                light = models.Environment(texels).coefficients(SHADING_DEGREE)
+                radiance = shading.shade_environment(lobes, light, normals, views)
+                return weights @ radiance, radiance
+
+            surface = [jnp.asarray(x, dtype) for x in (normals, views)]
+            for name, texels in maps.items():
+                texels = jnp.asarray(texels, dtype)
+                if "file" in name:
+                    path = Path(folder) / "bad.exr"
+                    write_exr(path, hard_cases.BAD_TEXELS)
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore", UserWarning)
+                        texels = models.Environment.load(path, dtype=dtype).texels[..., 0]
+                    refused = attempt(functools.partial(models.Environment.load, path, bad_texels="refuse"))
+                    results.setdefault("NaN and infinite texels, refused on request", []).append((refused, None, "-"))
+                slopes, got = shade(texels, *surface)
+                value, along, by_quadrature = exact[name]
+                size = np.sqrt(np.mean(value**2)) or 1.0
+                estimate = reference.shade_environment(
+                    brdf, models.Environment(texels), *surface, key=jax.random.key(2), samples=256
+                ).value
+                moved = [np.sum(np.asarray(s, float) * m) for s, m in zip(slopes, motion, strict=True)]
+                wrong = [abs(m - a) / max(abs(a), size) for m, a in zip(moved, along, strict=True)]
+                scale = np.sqrt(np.mean(by_quadrature**2)) or 1.0
+                results[name].append((
+                    cell(np.max(np.abs(np.asarray(got, float) - value)) / size),
+                    cell(np.max(wrong)),
+                    several([cell(np.max(np.abs(np.asarray(estimate, float) - by_quadrature)) / scale)]),
+                ))  # fmt: skip
+            slopes, got = shade(jnp.asarray(hard_cases.BAD_TEXELS, dtype), *surface)
+            results.setdefault("NaN and infinite texels, as they are", []).append(
+                (cell(np.max(np.asarray(got))), cell(np.max(np.asarray(slopes[1]))), "-")
+            )
+    rows = []
+    for name, both in results.items():
+        value, gradient, estimate = zip(*both, strict=True)
+        rows.append(row(name, "value", value, "-" if estimate[0] == "-" else "Monte Carlo", estimate))
+        if gradient[0] is not None:
+            rows.append(row(name, "gradient", gradient))
+    return rows
+
+
+def map_coefficients(texels):
+    """Coefficients of a map: trigonometric interpolation in the polar angle, then a product rule."""
+    height, width = texels.shape
+    around = np.concatenate([texels, np.roll(texels[::-1], width // 2, axis=1)])  # over the pole and back
+    at = np.pi * (np.arange(2 * height) + 0.5) / height
+    x, weights = np.polynomial.legendre.leggauss(64)
+    theta, phi = np.pi / 2 * (x + 1), 2 * np.pi * (np.arange(width) + 0.5) / width
+    k = np.arange(1, height)
+    step = theta[:, None] - at
+    kernel = 1 + 2 * np.cos(step[..., None] * k).sum(axis=-1) + np.cos(height * step)
+    values = kernel @ around / (2 * height)
+    area = (weights * np.pi / 2 * np.sin(theta) * 2 * np.pi / width)[:, None]
+    sine, cosine = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    w = np.stack(np.broadcast_arrays(sine * np.cos(phi), sine * np.sin(phi), cosine), axis=-1)
+    return (values * area).reshape(-1) @ truth.scipy_basis(w.reshape(-1, 3), SHADING_DEGREE)
+
+
+def environment_radiance(slice_of, e, normals, views):
+    """Integrals of slice times light, by a product rule that is exact."""
+    x, weights = np.polynomial.legendre.leggauss(SHADING_DEGREE + 2)
+    phi = 2 * np.pi * np.arange(2 * SHADING_DEGREE + 2) / (2 * SHADING_DEGREE + 2)
+    sine, cosine = np.sqrt(1 - x * x)[:, None], x[:, None]
+    w = np.stack(np.broadcast_arrays(sine * np.cos(phi), sine * np.sin(phi), cosine), axis=-1).reshape(-1, 3)
+    area = np.repeat(weights * 2 * np.pi / len(phi), len(phi))
+    frames = np.stack([frame_of(n) for n in normals]).astype(float)
+    slices = np.asarray(slice_of(jnp.asarray(np.einsum("pij,pj->pi", frames, np.asarray(views, float)))))
+    lobe = slices @ truth.scipy_basis(w, SHADING_DEGREE).T
+    light = truth.scipy_basis(np.einsum("qi,pij->pqj", w, frames), SHADING_DEGREE) @ e
+    return np.sum(area * lobe * light, axis=1)
+
+
+def write_exr(path, texels):
+    import OpenEXR
+
+    channels = {name: texels.astype(np.float32) for name in "RGB"}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
