@@ -110,6 +110,31 @@ def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]
     return (polar * azimuth[:, _tables.orders(degree) + degree]).reshape(*u.shape[:-1], -1)
 
 
+def weighted_sums(values: Float[Array, "*p_f"], u: Float[Array, "p 3"], degree: int) -> Float[Array, "*f_n"]:
+    """Sums over points of values times harmonics, through those of values times waves in theta and phi: no basis.
+
+    Derivatives: in the values; those in the unit vectors are left out.
+    """
+    series, _ = _basis_tables(degree)
+    tile = 1024  # larger ones leave the cache
+    fill = lambda a: jnp.pad(a, ((0, -a.shape[0] % tile), (0, 0))).reshape(-1, tile, a.shape[1])
+    flat = values.reshape(values.shape[0], -1)
+    angles = _angles(jax.lax.stop_gradient(u)).T
+
+    @jax.checkpoint
+    def add(total: Array, some: tuple[Array, Array]) -> tuple[Array, None]:
+        v, angles = some
+        theta, phi = (angle_multiples(c, s, degree + 1) for c, s in angles.T.reshape(2, 2, -1))
+        polar, waves = jnp.concatenate(theta), jnp.concatenate([phi[1][1:][::-1], phi[0]])  # orders from -degree
+        weighted = (v.T[:, None] * polar[None]).reshape(-1, tile)
+        return total + weighted @ waves.T, None
+
+    start = jnp.zeros((flat.shape[1] * series.shape[0], 2 * degree + 1), flat.dtype)
+    sums, _ = jax.lax.scan(add, start, (fill(flat), fill(angles)))
+    sums = sums.reshape(flat.shape[1], series.shape[0], -1)[:, :, _tables.orders(degree) + degree]
+    return jnp.sum(sums * jnp.asarray(series[None], u.dtype), axis=1).reshape(*values.shape[1:], -1)
+
+
 @_basis.defjvp
 def _basis_jvp(degree, primals, tangents):
     (u,), (du,) = primals, tangents

@@ -15,12 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._typing import Array, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics import _tables, sh_basis
+from shisd.harmonics import _tables
 from shisd.harmonics._pairing import rows
+from shisd.harmonics._sh import weighted_sums
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 
@@ -50,7 +52,7 @@ class Lobes(eqx.Module):
 
     def coefficients(self) -> Float[Array, "*colour_views n"]:
         """SH coefficients of the tabulated slices: [*colour, V, (L+1)^2] or [*colour, V, A, (L+1)^2]."""
-        return self.basis.coefficients(self.weights)
+        return self.basis.unchecked_coefficients(self.weights)
 
     def slice_coefficients(self, view: Float[Array, "3"]) -> Float[Array, "*colour n"]:
         """SH coefficients, in the local frame, of the slice seen from the local direction `view` [3], interpolated.
@@ -174,21 +176,30 @@ def tabulate_brdf(
         raise ValueError(f"`ridge` must be > 0; got {ridge}.")
     fit = float(ridge) if domain == "upper" else None
     nodes = 32 + basis.degree if quadrature is None else _checks.integer("quadrature", quadrature, 4)
-    return _tabulate(brdf, basis, views, azimuths, nodes, fit, float(tolerance), throw)
+    c, error = _slices(brdf, basis.degree, basis.directions.dtype, views, azimuths, nodes, fit)
+    return _decompose(c, error, basis, float(tolerance) if throw else None, brdf.isotropic, domain)
 
 
 @eqx.filter_jit
-def _tabulate(
-    brdf: AbstractBrdf,
-    basis: RotatedZonalBasis,
-    views: int,
-    azimuths: int,
-    quadrature: int,
-    ridge: float | None,
-    tolerance: float,
-    throw: bool,
+def _decompose(
+    c: Array, error: Scalar, basis: RotatedZonalBasis, tolerance: float | None, isotropic: bool, domain: str
 ) -> Lobes:
-    dtype = basis.directions.dtype
+    """What may refuse, apart from what takes long to compile: JAX does not store compiled code that can raise."""
+    if tolerance is not None:
+        c = eqx.error_if(
+            c,
+            ~(error <= tolerance),
+            "The quadrature does not resolve this material: a coarser rule differs by more than `tolerance`. "
+            "Pass a larger `quadrature`, or throw=False and read `quadrature_error`.",
+        )
+    return Lobes(basis, basis.weights(c), error, isotropic, domain)
+
+
+@eqx.filter_jit
+def _slices(
+    brdf: AbstractBrdf, degree: int, dtype: DTypeLike, views: int, azimuths: int, quadrature: int, ridge: float | None
+) -> tuple[Float[Array, "*colour_views n"], Scalar]:
+    """SH coefficients of the slices, and the quadrature's error."""
     theta = _views.elevations(views)
     phi = np.zeros(1) if brdf.isotropic else 2 * np.pi * np.arange(azimuths) / azimuths
     theta, phi = np.meshgrid(theta, phi, indexing="ij")
@@ -197,25 +208,18 @@ def _tabulate(
 
     @jax.checkpoint
     def project(view: Float[Array, "3"]) -> tuple[Array, Array]:
-        fine, coarse = (_project_slice(brdf, view, width, basis.degree, q) for q in (quadrature, 3 * quadrature // 4))
+        fine, coarse = (_project_slice(brdf, view, width, degree, q) for q in (quadrature, 3 * quadrature // 4))
         return fine, jnp.max(jnp.abs(fine - coarse))
 
     c, change = jax.lax.map(project, jnp.asarray(local.reshape(-1, 3), dtype))
     nodes = theta.shape[:1] if brdf.isotropic else theta.shape
     c = jnp.moveaxis(c.reshape(*nodes, *c.shape[1:]), range(len(nodes)), range(-1 - len(nodes), -1))  # colour first
     error = jax.lax.stop_gradient(jnp.max(change) / jnp.maximum(jnp.max(jnp.abs(c)), jnp.finfo(dtype).tiny))
-    if throw:
-        c = eqx.error_if(
-            c,
-            ~(error <= tolerance),
-            "The quadrature does not resolve this material: a coarser rule differs by more than `tolerance`. "
-            "Pass a larger `quadrature`, or throw=False and read `quadrature_error`.",
-        )
     if ridge is not None:
-        modes, shares = _hemisphere_modes(basis.degree)
+        modes, shares = _hemisphere_modes(degree)
         modes = jnp.asarray(modes, dtype)
         c = ((c @ modes) * jnp.asarray(1 / (shares + ridge), dtype).reshape((1,) * (c.ndim - 1) + (-1,))) @ modes.T
-    return Lobes(basis, basis.weights(c), error, brdf.isotropic, "sphere" if ridge is None else "upper")
+    return c, error
 
 
 @functools.cache
@@ -243,10 +247,10 @@ def _project_slice(
     """SH coefficients of w -> value_cosine(w, view), bands 0 ... degree."""
     w, weight = _nodes(view, width, quadrature, half=brdf.isotropic)
     values = jax.vmap(lambda wi: brdf.value_cosine(wi, view))(w)  # [nodes, *colour]
-    y = sh_basis(w, degree) * weight[:, None]
-    if brdf.isotropic:  # seen from azimuth 0, the slice is even in y: half the nodes do, and sine components vanish
-        y *= jnp.asarray(_tables.orders(degree)[None, :] >= 0, y.dtype)
-    return jnp.einsum("p...,pn->...n", values, y)
+    values *= weight.reshape(-1, *(1,) * (values.ndim - 1))
+    c = weighted_sums(values, w, degree)
+    # seen from azimuth 0, the slice is even in y: half the nodes do, and sine components vanish
+    return jnp.where(_tables.orders(degree) >= 0, c, 0) if brdf.isotropic else c
 
 
 def _nodes(
