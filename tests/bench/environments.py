@@ -15,9 +15,11 @@ To add a family: a function of a Scene that returns its methods, listed in FAMIL
 
 import argparse
 import functools
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +30,7 @@ from tests.bench.harness import Method, Task
 
 SIDE, JUDGED = 128, 256
 STORED = Path(__file__).parent / "data" / "references_environments.npz"
+FITTED = STORED.with_name("gaussians_environments.npz")
 COPPER = np.array([0.955, 0.638, 0.538])
 MATERIALS = {
     "clay": models.Lambertian(np.full(3, 0.8)),
@@ -37,6 +40,7 @@ MATERIALS = {
 }
 MAPS = ("interior", "studio", "sun")
 DEGREES, VIEWS = (4, 8, 16, 30), 32
+PARTS = ("directions", "sharpness", "weights")  # of a table of Gaussians
 
 
 @dataclass(frozen=True)
@@ -96,13 +100,25 @@ def pixels():
     return tuple(a[order] for a in lobes.sphere_points(SIDE, SIDE))
 
 
+_seen = set()
+
+
+def timed(kind: str, function):
+    """A result and the seconds of a call, after one that compiles for the first of its kind."""
+    if kind not in _seen:
+        jax.block_until_ready(function())
+        _seen.add(kind)
+    start = time.perf_counter()
+    return jax.block_until_ready(function()), time.perf_counter() - start
+
+
 # --- ours
 
 
 @functools.cache
 def coefficients(name: str):
     """The map's coefficients to the highest degree that anything needs, and seconds."""
-    return lobes.timed(lambda: environment(name).coefficients(255))
+    return timed("coefficients", lambda: environment(name).coefficients(255))
 
 
 @functools.cache
@@ -113,12 +129,16 @@ def tables(material: str):
         directions = jnp.asarray(decomposition.optimized_directions(degree), jnp.float32)
         bases[degree] = decomposition.RotatedZonalBasis(directions, degree)
     brdf, most = MATERIALS[material], bases[DEGREES[-1]]
-    table, seconds = lobes.timed(lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64))
-    c = table.coefficients()
-    cut = lambda degree, basis: shading.Lobes(
-        basis, basis.weights(c[..., : (degree + 1) ** 2]), table.quadrature_error, True
-    )
-    return {degree: cut(degree, basis) for degree, basis in bases.items()}, seconds
+    kind = type(brdf).__name__
+    table, seconds = timed(kind, lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64))
+    return {degree: _cut(table, basis) for degree, basis in bases.items()}, seconds
+
+
+@eqx.filter_jit
+def _cut(table, basis):
+    """A table on a basis of lower degree."""
+    c = table.coefficients()[..., : (basis.degree + 1) ** 2]
+    return shading.Lobes(basis, basis.weights(c), table.quadrature_error, True)
 
 
 def shade(parameters, normals, views):
@@ -155,7 +175,7 @@ def shisd(scene: Scene) -> list[Method]:
 @functools.cache
 def samplers(name: str):
     texels = np.asarray(environment(name).texels)
-    tables, seconds = lobes.timed(lambda: monte_carlo.light_tables(texels))
+    tables, seconds = timed("samplers", lambda: monte_carlo.light_tables(texels))
     shifts = jnp.asarray(np.random.default_rng(1).random((SIDE**2, 4)), jnp.float32)
     return {**tables, "shifts": shifts}, seconds
 
@@ -196,7 +216,12 @@ def slices(material: str):
     by_degree, seconds = tables(material)
     theta = (np.arange(2 * VIEWS) + 0.5) * (np.pi / 4 / VIEWS)
     local = jnp.asarray(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=1), jnp.float32)
-    return {degree: jax.vmap(by_degree[degree].slice_coefficients)(local) for degree in DEGREES[:-1]}, seconds
+    return {degree: _slices(by_degree[degree], local) for degree in DEGREES[:-1]}, seconds
+
+
+@eqx.filter_jit
+def _slices(table, local):
+    return jax.vmap(table.slice_coefficients)(local)
 
 
 def rotations(scene: Scene) -> list[Method]:
@@ -219,7 +244,7 @@ def albedo(material: str):
     brdf = MATERIALS[material]
     if material == "clay":
         return brdf.albedo[None], 0.0
-    scale, seconds = lobes.timed(lambda: split_sum.ggx_scale(float(brdf.alpha), COPPER))
+    scale, seconds = timed("scale", lambda: split_sum.ggx_scale(float(brdf.alpha), COPPER))
     return jnp.asarray(scale, jnp.float32), seconds
 
 
@@ -230,7 +255,7 @@ def split_sums(scene: Scene) -> list[Method]:
     forward, gradient = functions(split_sum.radiance, "texels", glossy=scene.glossy)
     methods = []
     for height in scene.some((64, 128)):
-        texels, filtering = lobes.timed(lambda height=height: split_sum.filtered(light, kernel, height))
+        texels, filtering = timed(f"filtered {height}", lambda height=height: split_sum.filtered(light, kernel, height))
         parameters = {"texels": texels, "scale": scale}
         setup = projection + seconds + filtering
         methods.append(Method("split sum", f"{height} x {2 * height} map", forward, parameters, gradient, setup))
@@ -239,12 +264,26 @@ def split_sums(scene: Scene) -> list[Method]:
 
 @functools.cache
 def pyramid(name: str):
-    return lobes.timed(lambda: lobes.gaussian_pyramid(environment(name)))
+    return timed("pyramid", lambda: lobes.gaussian_pyramid(environment(name)))
 
 
 @functools.cache
 def fit(material: str, count: int):
-    return lobes.timed(lambda: lobes.fit_table(MATERIALS[material], count))
+    """The stored fit and its seconds."""
+    stored = np.load(FITTED)
+    *parts, seconds = (stored[f"{material}, {count}: {name}"] for name in (*PARTS, "seconds"))
+    return jax.vmap(decomposition.GaussianLobes)(*(jnp.asarray(part) for part in parts)), float(seconds)
+
+
+def make_fits():
+    arrays = {}
+    for material, brdf in MATERIALS.items():
+        for count in (1, 3, 7):
+            kind, name = f"{type(brdf).__name__}, {count} Gaussians", f"{material}, {count}"
+            table, seconds = timed(kind, lambda brdf=brdf, count=count: lobes.fit_table(brdf, count))
+            arrays |= {f"{name}: {part}": getattr(table, part) for part in PARTS} | {f"{name}: seconds": seconds}
+            print(f"{name} Gaussians: {seconds:.2f} s", flush=True)
+    np.savez_compressed(FITTED, **arrays)
 
 
 def shade_gaussians(parameters, normals, views):
@@ -284,7 +323,7 @@ def tasks(quick: bool) -> list[Task]:
 # --- references
 
 
-def make():
+def make_references():
     arrays = {}
     normals, views = (np.asarray(a[:JUDGED], float) for a in pixels())
     for name in MAPS:
@@ -298,12 +337,12 @@ def make():
             error = np.sqrt(np.mean((values[:16] - finer) ** 2) / np.mean(finer**2))
             arrays[f"{material}, {name}"], arrays[f"{material}, {name}: error"] = values, error
             print(f"{material}, {name}: RMS {np.sqrt(np.mean(values**2)):.4g}, error {error:.1e}", flush=True)
-    STORED.parent.mkdir(exist_ok=True)
     np.savez_compressed(STORED, **arrays)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--make", action="store_true", required=True, help="make the references again")
+    parser.add_argument("--make", action="store_true", required=True, help="make the stored references and fits again")
     parser.parse_args()
-    make()
+    make_fits()
+    make_references()

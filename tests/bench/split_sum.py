@@ -5,6 +5,8 @@ spherical harmonics), so no error comes from interpolation between levels of rou
 irradiance along the normal. Look-ups are bilinear.
 """
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -51,12 +53,15 @@ def lookup(texels, x, y, z):
 def filtered(coefficients, kernel, height: int):
     """The map convolved with a function of the angle, normalised: texels [(H+2) (2H+1), 4], rows of 16 bytes."""
     degree = min(height - 1, int(np.sqrt(coefficients.shape[-1])) - 1)
-    x, weight = np.polynomial.legendre.leggauss(2048)
+    x, weight = (0.5 * g + shift for g, shift in zip(gauss(256), (0.5, 0), strict=True))  # kernels vanish below 0
     p = np.polynomial.legendre.legvander(x, degree) * (weight * kernel(x))[:, None]
     bands = (p.sum(axis=0) / p[:, 0].sum())[np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)]
     c = coefficients[:, : (degree + 1) ** 2] * jnp.asarray(bands, coefficients.dtype)[None]
     texels = padded(harmonics.synthesize_map(c, height), height)
     return jnp.pad(texels, ((0, 0), (0, 1)))
+
+
+gauss = functools.cache(np.polynomial.legendre.leggauss)
 
 
 def ggx_kernel(alpha: float):
