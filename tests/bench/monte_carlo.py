@@ -123,10 +123,11 @@ def radiance(parameters, normals, views, *, of_light: int, of_material: int, glo
             hits.append(take(parameters["hits"], cell))
         if of_material:
             wi = jax.lax.stop_gradient(sample(parameters, n, v, nv, shift[2:], of_material, glossy))
+            wi = jax.lax.optimization_barrier(wi)
             directions.append(wi)
             hits.append(texel_of(*wi, height_of(texels)))
-        l = jnp.concatenate(directions, axis=1)  # [3, S, P]
-        rows = take(texels, jnp.concatenate(hits))
+        l, hits = jax.lax.optimization_barrier((jnp.concatenate(directions, axis=1), jnp.concatenate(hits)))
+        rows = take(texels, hits)
         values, density = rows[..., :3], jax.lax.stop_gradient(rows[..., 3])
         nl, vl = dot(n[:, None], l), dot(v[:, None], l)
         f, own, fresnel = material(parameters, nl, nv[None], vl, glossy)
@@ -183,9 +184,9 @@ def sample(parameters, n, v, nv, shift, count, glossy):
     u = (jnp.asarray(points[:, :1], n.dtype) + shift[:1]) % 1  # [S, P]
     angle, turn = 2 * np.pi * points[:, 1:], 2 * np.pi * shift[1:]
     cos, sin = (jnp.asarray(f(angle), n.dtype) for f in (np.cos, np.sin))
-    cos_s, sin_s = jnp.cos(turn), jnp.sin(turn)
+    cos_s, sin_s, *frame = jax.lax.optimization_barrier((jnp.cos(turn), jnp.sin(turn), *tangents(n)))
     cos, sin = cos * cos_s - sin * sin_s, sin * cos_s + cos * sin_s
-    t, b = tangents(n)
+    t, b = frame
     if not glossy:
         radius, z = jnp.sqrt(u), jnp.sqrt(1 - u)
         return to_world(radius * cos, radius * sin, z, t, b, n)
@@ -197,7 +198,8 @@ def sample(parameters, n, v, nv, shift, count, glossy):
     radius = jnp.sqrt(jnp.maximum(1 - z * z, 0))
     hx, hy, hz = alpha * (radius * cos + sx), alpha * (radius * sin + sy), jnp.maximum(z + sz, 0)
     scale = jax.lax.rsqrt(hx * hx + hy * hy + hz * hz)
-    h = to_world(hx * scale, hy * scale, hz * scale, t, b, n)
+    hx, hy, hz = jax.lax.optimization_barrier((hx * scale, hy * scale, hz * scale))
+    h = jax.lax.optimization_barrier(to_world(hx, hy, hz, t, b, n))
     return 2 * dot(v[:, None], h)[None] * h - v[:, None]
 
 
