@@ -46,6 +46,13 @@ def light_tables(texels: np.ndarray, seed: int = 0) -> dict[str, jax.Array]:
     }
 
 
+def shifts(count: int, seed: int = 1) -> jax.Array:
+    """Shifts of the nets [count, 5]: two for the light; one, and cosine and sine of the second, for the material."""
+    u = np.random.default_rng(seed).random((count, 4))
+    turn = 2 * np.pi * u[:, 3:]
+    return jnp.asarray(np.concatenate([u[:, :3], np.cos(turn), np.sin(turn)], axis=1), jnp.float32)
+
+
 def _invert(mass, row, u):
     """The bin of a row of `mass` that holds u, and the position in it."""
     total = np.cumsum(mass, axis=1)
@@ -106,37 +113,36 @@ def net(count: int) -> np.ndarray:
 def radiance(parameters, normals, views, *, of_light: int, of_material: int, glossy: bool):
     """Radiance [P, 3] from so many samples of the light and of the material.
 
-    parameters: those of `light_tables`; `shifts` [P, 4] in [0, 1); `albedo` [3], or `alpha` and `f0` [3] of GGX.
+    parameters: those of `light_tables`; `shifts` [P, 5] of `shifts`; `albedo` [3], or `alpha` and `f0` [3] of GGX.
     """
-    size = max(64, NUMBERS // (of_light + of_material))
+    texels = parameters["texels"]
+
+    def seen(n, v, nv, l, hits):
+        """What samples in the directions `l`, three arrays [S, P], on the texels `hits` add to the radiance."""
+        rows = take(texels, hits)
+        nl, vl = dot(n, l), dot(v, l)
+        f, own, fresnel = material(parameters, nl, nv, vl, glossy)
+        density = of_light * rows[..., 3] if of_light else 0
+        density = jax.lax.stop_gradient(density + of_material * own if of_material else density)
+        weight = jnp.where(nl > 0, f / jnp.where(density > 0, density, 1), 0)
+        return totals([weight * fresnel(c) * rows[..., c] for c in range(3)])
 
     def tile(n, v, shift):
-        n, v, shift = n.T, v.T, shift.T
+        n, v, shift = n.T[:, None], v.T[:, None], shift.T
         nv = dot(n, v)
-        texels = parameters["texels"]
-        directions, hits = [], []
+        total = 0.0
         if of_light:
             u = (jnp.asarray(net(of_light), n.dtype)[:, :, None] + shift[None, :2]) % 1
             cell = jnp.minimum((u * POOL).astype(jnp.int32), POOL - 1)
             cell = cell[:, 0] * POOL + cell[:, 1]
-            directions.append(jnp.moveaxis(take(parameters["directions"], cell), -1, 0))
-            hits.append(take(parameters["hits"], cell))
+            l = take(parameters["directions"], cell)
+            total += seen(n, v, nv, (l[..., 0], l[..., 1], l[..., 2]), take(parameters["hits"], cell))
         if of_material:
-            wi = jax.lax.stop_gradient(sample(parameters, n, v, nv, shift[2:], of_material, glossy))
-            wi = jax.lax.optimization_barrier(wi)
-            directions.append(wi)
-            hits.append(texel_of(*wi, height_of(texels)))
-        l, hits = jax.lax.optimization_barrier((jnp.concatenate(directions, axis=1), jnp.concatenate(hits)))
-        rows = take(texels, hits)
-        values, density = rows[..., :3], jax.lax.stop_gradient(rows[..., 3])
-        nl, vl = dot(n[:, None], l), dot(v[:, None], l)
-        f, own, fresnel = material(parameters, nl, nv[None], vl, glossy)
-        density = (of_light * density if of_light else 0) + (
-            of_material * jax.lax.stop_gradient(own) if of_material else 0
-        )
-        weight = jnp.where(nl > 0, f / jnp.where(density > 0, density, 1), 0)
-        return jnp.stack([jnp.sum(weight * fresnel(c) * values[..., c], axis=0) for c in range(3)], axis=-1)
+            l = jax.lax.stop_gradient(sample(parameters, n, v, nv, shift[2:, None], of_material, glossy))
+            total += seen(n, v, nv, l, texel_of(*l, height_of(texels)))
+        return total
 
+    size = max(64, NUMBERS // (of_light + of_material))
     return in_tiles(tile, size, normals, views, parameters["shifts"])
 
 
@@ -150,7 +156,7 @@ def point_lights(parameters, normals, views, *, glossy: bool):
         nl, vl = dot(l, n[:, None]), dot(l, v[:, None])
         f, _, fresnel = material(parameters, nl, dot(n, v)[None], vl, glossy)
         weight = jnp.where(nl > 0, f, 0)
-        return jnp.stack([jnp.sum(weight * fresnel(c) * lights[:, 3 + c, None], axis=0) for c in range(3)], axis=-1)
+        return totals([weight * fresnel(c) * lights[:, 3 + c, None] for c in range(3)])
 
     return in_tiles(tile, max(64, NUMBERS // len(lights)), normals, views)
 
@@ -179,17 +185,16 @@ def material(parameters, nl, nv, vl, glossy):
 
 
 def sample(parameters, n, v, nv, shift, count, glossy):
-    """World directions [3, S, P] by the cosine or by visible normals."""
+    """World directions, three arrays [S, P], by the cosine or by visible normals."""
     points = net(count)
-    u = (jnp.asarray(points[:, :1], n.dtype) + shift[:1]) % 1  # [S, P]
-    angle, turn = 2 * np.pi * points[:, 1:], 2 * np.pi * shift[1:]
+    u = (jnp.asarray(points[:, :1], n.dtype) + shift[0]) % 1  # [S, P]
+    angle = 2 * np.pi * points[:, 1:]
     cos, sin = (jnp.asarray(f(angle), n.dtype) for f in (np.cos, np.sin))
-    cos_s, sin_s, *frame = jax.lax.optimization_barrier((jnp.cos(turn), jnp.sin(turn), *tangents(n)))
-    cos, sin = cos * cos_s - sin * sin_s, sin * cos_s + cos * sin_s
-    t, b = frame
+    cos, sin = cos * shift[1] - sin * shift[2], sin * shift[1] + cos * shift[2]
+    t, b = tangents(n)
     if not glossy:
         radius, z = jnp.sqrt(u), jnp.sqrt(1 - u)
-        return to_world(radius * cos, radius * sin, z, t, b, n)
+        return tuple(radius * (cos * t[i] + sin * b[i]) + z * n[i] for i in range(3))
     alpha = parameters["alpha"]
     vx, vy = alpha * dot(t, v), alpha * dot(b, v)
     scale = jax.lax.rsqrt(vx * vx + vy * vy + nv * nv)
@@ -198,9 +203,22 @@ def sample(parameters, n, v, nv, shift, count, glossy):
     radius = jnp.sqrt(jnp.maximum(1 - z * z, 0))
     hx, hy, hz = alpha * (radius * cos + sx), alpha * (radius * sin + sy), jnp.maximum(z + sz, 0)
     scale = jax.lax.rsqrt(hx * hx + hy * hy + hz * hz)
-    hx, hy, hz = jax.lax.optimization_barrier((hx * scale, hy * scale, hz * scale))
-    h = jax.lax.optimization_barrier(to_world(hx, hy, hz, t, b, n))
-    return 2 * dot(v[:, None], h)[None] * h - v[:, None]
+    h = tuple(scale * (hx * t[i] + hy * b[i] + hz * n[i]) for i in range(3))
+    vh = 2 * dot(v, h)
+    return tuple(vh * h[i] - v[i] for i in range(3))
+
+
+@jax.custom_jvp
+def totals(terms):
+    """Sums [P, 3] over the samples of three arrays [S, P], in one pass: XLA would make their factors once for each."""
+    zero = np.zeros((), terms[0].dtype)
+    add = lambda a, b: tuple(x + y for x, y in zip(a, b, strict=True))
+    return jnp.stack(jax.lax.reduce(tuple(terms), (zero,) * 3, add, (0,)), axis=-1)
+
+
+@totals.defjvp
+def _totals_jvp(primals, tangents):
+    return totals(*primals), jnp.stack([jnp.sum(x, axis=0) for x in tangents[0]], axis=-1)
 
 
 def tangents(n):
@@ -210,10 +228,6 @@ def tangents(n):
     a = -1 / (sign + z)
     b = x * y * a
     return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
-
-
-def to_world(x, y, z, t, b, n):
-    return jnp.stack([x * t[i] + y * b[i] + z * n[i] for i in range(3)])
 
 
 def dot(a, b):
