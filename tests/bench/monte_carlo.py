@@ -2,10 +2,12 @@
 
 Points are a Hammersley net, shifted on the torus for every pixel by a table of random numbers, as real-time renderers
 take them from a texture. The map is sampled through a pool of 65,536 directions, one in each cell of a stratified unit
-square, drawn before by inversion of its distribution (row, then column): a sample then costs one look-up, as in the
-pre-sampled lights of Wyman and Panteleev 2021; bisection in place of it took twice as long. GGX is sampled by visible
-normals (Dupuy and Benyoub 2023), Lambert by the cosine. Both strategies together share the samples by the balance
-heuristic. Radiance is that of the nearest texel. Samples stand before pixels: pixels are vector lanes.
+square, drawn before by inversion of its distribution (row, then column): a sample costs one look-up and no search, as
+with the pre-sampled lights of Wyman and Panteleev 2021. GGX is sampled by visible normals (Dupuy and Benyoub 2023),
+Lambert by the cosine. Both strategies together share the samples by the balance heuristic. Radiance is that of the
+nearest texel. Samples stand before pixels: pixels are vector lanes.
+
+Point lights: the same few directions for all pixels, spread by the map's distribution (as Agarwal et al. 2003).
 
 Derivatives hold the sampled directions of the light in the world, those of the material, and all densities fixed
 (detached sampling).
