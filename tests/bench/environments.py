@@ -55,7 +55,7 @@ class Scene:
         return MATERIALS[self.material]
 
     @property
-    def timed(self):
+    def with_gradients(self):
         """Whether gradients are asked for: what they cost depends on no map and not on the kind of gloss."""
         return self.map == "interior" and self.material in ("clay", "GGX 0.25")
 
@@ -318,7 +318,7 @@ def tasks(quick: bool) -> list[Task]:
         for name in ("interior",) if quick else MAPS:
             scene, title = Scene(material, name, quick), f"{material}, {name}"
             methods = [method for family in FAMILIES for method in family(scene)]
-            if not scene.timed:
+            if not scene.with_gradients:
                 methods = [replace(method, gradient=None) for method in methods]
             made.append(
                 Task(f"environment: {title}", title, "pixel", pixels(), stored[title], float(stored[f"{title}: error"]),
