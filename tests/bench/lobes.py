@@ -27,6 +27,7 @@ from shisd._numerics import normalize
 from shisd.decomposition._kernels import gaussian_zonal
 from shisd.shading import _lobes, _surface, _views
 from tests.bench.equation_22 import local_frames
+from tests.bench.monte_carlo import arccos, arctan2
 from tests.bench.timing import interleaved
 from tests.models.materials import GOLD_PAINT, NICKEL
 
@@ -195,15 +196,23 @@ def rotated(frames, z):
     return jnp.einsum("pij,pkj->pki", frames, z)
 
 
-def bilinear(height, w):
+def angles(w):
+    """theta and phi [..] of directions, to 1e-5: the polynomials are vectorised, XLA's own arc functions are not."""
+    return kept(arccos(jnp.clip(w[..., 2], -1, 1))), kept(arctan2(w[..., 1], w[..., 0]))
+
+
+def kept(x):
+    """x > -4 by way of its logarithm: cheap arithmetic XLA repeats on a CPU for every look-up that needs it."""
+    return jnp.exp(jnp.log(x + 4)) - 4
+
+
+def bilinear(height, theta, phi):
     """Flat indices [.., 4] into a map with a row beyond each pole and a column beyond its end, and weights."""
-    theta = jnp.arctan2(jnp.hypot(w[..., 0], w[..., 1]), w[..., 2])
-    phi = jnp.arctan2(w[..., 1], w[..., 0])
-    h = height.astype(w.dtype)
+    h = height.astype(theta.dtype)
     v = theta * (h / np.pi) + 0.5
     u = (phi * (h / np.pi) - 0.5) % (2 * h)
     j, i = jnp.clip(v.astype(int), 0, height), jnp.clip(u.astype(int), 0, 2 * height - 1)
-    v, u = v - j.astype(w.dtype), u - i.astype(w.dtype)
+    v, u = v - j.astype(theta.dtype), u - i.astype(theta.dtype)
     first = j * (2 * height + 1) + i
     index = jnp.stack([first, first + 1, first + 2 * height + 1, first + 2 * height + 2], axis=-1)
     return index, jnp.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=-1)
@@ -231,29 +240,41 @@ def gaussian_pyramid(environment):
         maps = maps.reshape(*maps.shape[:2], len(own), 3)
         parts += [padded(maps[:, :, i], int(height)) for i in range(len(own))]
     sizes = [len(p) for p in parts]
-    return jnp.concatenate(parts), np.cumsum([0, *sizes[:-1]]).astype(np.int32), heights
+    texels = jnp.pad(jnp.concatenate(parts), ((0, 0), (0, 1)))  # rows of 16 bytes
+    return texels, np.cumsum([0, *sizes[:-1]]).astype(np.int32), heights
 
 
 @eqx.filter_jit
 def shade_gaussians(table, pyramid, normals, views):
+    """Radiance [P, 3]. Inside a tile pixels stand last: they are vector lanes."""
     texels, firsts, heights = pyramid
     firsts, heights = jnp.asarray(firsts), jnp.asarray(heights)
+    count = table.sharpness.shape[1]
+    parts = [jnp.swapaxes(table.directions, 1, 2), jnp.log(table.sharpness)[:, None], table.weights]
+    rows_of_table = jnp.concatenate(parts, axis=1).reshape(VIEWS, -1)
 
     def tile(rows):
         frames, theta = local_frames(rows["normals"], rows["views"])
-        lobes = jax.vmap(lambda t: interpolated(table, t))(theta)
-        w = rotated(frames, lobes.directions)
-        level = jnp.clip(2 * jnp.log2(lobes.sharpness) + 2, 0, len(LADDER) - 1.001)
+        lower, t = neighbours(theta)
+        mixed = (1 - t)[:, None] * rows_of_table[lower] + t[:, None] * rows_of_table[lower + 1]
+        mixed = mixed.T.reshape(-1, count, len(theta))
+        z, log_sharpness, weights = mixed[:3], mixed[3], mixed[4:]
+        z = z * jax.lax.rsqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2)[None]
+        theta, phi = angles(jnp.einsum("pij,jkp->kpi", frames, z))
+        sharpness = jnp.exp(log_sharpness)
+        integral = -2 * np.pi * jnp.expm1(-2 * sharpness) / sharpness
+        level = jnp.clip(2 / np.log(2) * log_sharpness + 2, 0, len(LADDER) - 1.001)
         lower = level.astype(int)
         t = level - lower.astype(level.dtype)
         total = 0.0
         for k, share in ((lower, 1 - t), (lower + 1, t)):
-            index, weight = bilinear(heights[k], w)
-            total += jnp.einsum("pkq,pkqc->pkc", weight * share[..., None], texels[firsts[k][..., None] + index])
-        integral = -2 * np.pi * jnp.expm1(-2 * lobes.sharpness) / lobes.sharpness
-        return jnp.einsum("pck,pkc->pc", lobes.weights * integral[:, None], total)
+            index, weight = bilinear(heights[k], theta, phi)
+            index, weight = firsts[k][..., None] + index, (share * integral)[..., None] * weight
+            for corner in range(4):
+                total += weight[..., corner, None] * texels.at[index[..., corner]].get(mode="promise_in_bounds")
+        return jnp.einsum("ckp,kpc->pc", weights, total[..., :3])
 
-    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 256)
+    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 1024)
 
 
 def band_table(environment, degree, height=128):
@@ -271,7 +292,7 @@ def shade_profiles(table, texels, normals, views, at, height=128):
     def tile(rows):
         frames, theta = local_frames(rows["normals"], rows["views"])
         lobes = jax.vmap(lambda t: at(table, t))(theta)
-        index, weight = bilinear(jnp.asarray(height), rotated(frames, lobes.directions))
+        index, weight = bilinear(jnp.asarray(height), *angles(rotated(frames, lobes.directions)))
         value = jnp.einsum("pkq,pkqx->pkx", weight, texels[index])
         value = value.reshape(*value.shape[:2], -1, 3)
         return jnp.einsum("pclk,pklc->pc", lobes.weights, value)
