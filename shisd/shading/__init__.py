@@ -9,3 +9,4 @@ from shisd.shading._lobes import tabulate_brdf as tabulate_brdf
 from shisd.shading._polygon import project_light as project_light
 from shisd.shading._polygon import shade_polygon as shade_polygon
 from shisd.shading._polygon import shade_portal as shade_portal
+from shisd.shading._zonal import shade_zonal as shade_zonal
