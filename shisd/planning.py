@@ -32,7 +32,6 @@ from shisd.harmonics import _tables, convolve, evaluate, multiply, sphere_rule
 from shisd.models import AbstractBrdf, Environment, PolygonLight, PortalLight
 from shisd.shading import (
     Lobes,
-    _views,
     project_light,
     shade_environment,
     shade_polygon,
@@ -44,8 +43,8 @@ from shisd.shading._lobes import RIDGE, fit_above, hemisphere_blocks, project_sl
 from shisd.shading._polygon import incident_radiance
 
 Light = Environment | PolygonLight | PortalLight | ArrayLike
-_ELEVATIONS = 16  # of the views whose slices are judged
-_AZIMUTHS = 6  # the same, for anisotropic materials
+_ELEVATIONS = 12  # of the views whose slices are judged: Gauss nodes
+_AZIMUTHS = 6  # of these views, for anisotropic materials
 
 
 class Scene(eqx.Module):
@@ -88,7 +87,7 @@ class Entry(NamedTuple):
     path: str
     degree: int
     error: float  # predicted RMS
-    bound: float  # on every error, from the same bands
+    bound: float  # on the RMS whatever way materials and lights are turned, from the same bands
     cost: float  # multiply-adds per pixel; 0 for a light that joins another
     joined: str  # the light that it is added to before the path is taken, or ""
     met: bool
@@ -511,13 +510,12 @@ _Seen = _Distant | _Local
 
 
 def _material(brdf: AbstractBrdf, degree: int, views: int) -> _Material:
-    theta, phi = _views.elevations(_ELEVATIONS), np.zeros(1)
-    if not brdf.isotropic:
-        phi = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
-    theta, phi = (x.ravel() for x in np.meshgrid(theta, phi, indexing="ij"))
+    nodes, weights = np.polynomial.legendre.leggauss(_ELEVATIONS)
+    azimuths = np.arange(1 if brdf.isotropic else _AZIMUTHS) / _AZIMUTHS
+    theta, phi = (x.ravel() for x in np.meshgrid((nodes + 1) * np.pi / 4, 2 * np.pi * azimuths, indexing="ij"))
     local = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
     c = np.asarray(_slices(brdf, jnp.asarray(local, float), degree), float)  # [V, *colour, n]
-    shares = np.sin(2 * theta)
+    shares = np.repeat(weights, len(azimuths)) * np.sin(2 * theta)
     coefficients = np.moveaxis(c.reshape(len(theta), -1, c.shape[-1]), 0, 1)
     return _Material(coefficients, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, views)
 
@@ -578,14 +576,15 @@ def _judge(path: type[Path], material: _Material, light: _Seen, degree: int) -> 
 
 
 def predict(slices: np.ndarray, lights: np.ndarray, shares: np.ndarray) -> tuple[float, float]:
-    """RMS and bound of the product of slices and lights, from norms of their bands [C, V, l] and [C, P, l].
+    """RMS of the product of slices and lights, and a bound on it, from norms of their bands [C, V, l] and [C, P, l].
 
-    The RMS is over all rotations between the two, views by their `shares` [V], points and colours.
+    The RMS is over views by their `shares` [V], points, colours, and all rotations between slices and lights; the bound
+    holds for the worst of the rotations.
     """
-    l = np.arange(slices.shape[-1])
-    energy = np.einsum("v,cvl->cl", shares, slices**2) * np.mean(lights**2, axis=1) / (2 * l + 1)
-    bound = np.max(slices[:, :, None] * lights[:, None] @ np.ones(len(l)))
-    return float(np.sqrt(np.mean(np.sum(energy, axis=-1)))), float(bound)
+    energy = np.einsum("v,cvl->cl", shares, slices**2) * np.mean(lights**2, axis=1)
+    worst = slices @ np.swapaxes(lights, 1, 2)  # [C, V, P]
+    square = np.mean(np.sum(energy / (2 * np.arange(slices.shape[-1]) + 1), axis=-1))
+    return float(np.sqrt(square)), float(np.sqrt(np.mean(np.einsum("v,cvp->cp", shares, worst**2))))
 
 
 def _choose(material: _Material, light: _Seen, target: float, max_degree: int) -> _Choice:
@@ -637,23 +636,38 @@ def _bands_squared(degree: int) -> float:
 
 
 class _Tables:
-    """Lobes of a material to some degree, tabulated once, and from them those of lower degrees, each made once."""
+    """Lobes of a material, tabulated once to some degree; those of lower degrees are cut from them, on the host."""
 
     def __init__(self, brdf: AbstractBrdf, degree: int, views: int):
-        basis = RotatedZonalBasis(optimized_directions(degree), degree)
-        self._all = tabulate_brdf(brdf, basis, views=views)
+        self._all = tabulate_brdf(brdf, RotatedZonalBasis(optimized_directions(degree), degree), views=views)
+        weights = np.asarray(self._all.weights, float)
+        self._coefficients = np.concatenate(
+            [weights[..., l, :] @ m.T for l, m in enumerate(_band_matrices(degree))], axis=-1
+        )
         self._made: dict[tuple[int, bool], Lobes] = {}
 
     def lobes(self, degree: int, above: bool = False) -> Lobes:
         if (degree, above) not in self._made:
-            basis = RotatedZonalBasis(optimized_directions(degree), degree)
-            c = self._all.coefficients()[..., : (degree + 1) ** 2]
-            c = fit_above(c, RIDGE) if above else c
-            lobes = self._all
-            domain = "upper" if above else "sphere"
-            made = Lobes(basis, basis.weights(c), lobes.quadrature_error, lobes.isotropic, domain)
-            self._made[degree, above] = made
+            self._made[degree, above] = self._cut(degree, above)
         return self._made[degree, above]
+
+    def _cut(self, degree: int, above: bool) -> Lobes:
+        c = self._coefficients[..., : (degree + 1) ** 2]
+        if above:
+            c = np.asarray(fit_above(jnp.asarray(c, float), RIDGE), float)
+        bands = np.split(c, np.arange(1, degree + 1) ** 2, axis=-1)
+        weights = [b @ np.linalg.pinv(m).T for b, m in zip(bands, _band_matrices(degree), strict=True)]
+        basis = RotatedZonalBasis(optimized_directions(degree), degree)
+        every, domain = self._all, "upper" if above else "sphere"
+        table = jnp.asarray(np.stack(weights, axis=-2), float)
+        return Lobes(basis, table, every.quadrature_error, every.isotropic, domain)
+
+
+def _band_matrices(degree: int) -> list[np.ndarray]:
+    """M_l of the optimised axes (ISD15 Eq. 10), for every band."""
+    y = _tables.basis(np.asarray(optimized_directions(degree), float), degree)
+    norms = _tables.zonal_norms(degree)
+    return [y[:, l * l : (l + 1) ** 2].T / norms[l] for l in range(degree + 1)]
 
 
 def _sum(lights: list[_Distant], degree: int) -> Float[Array, "*colour n"]:
