@@ -77,6 +77,8 @@ class Scene(eqx.Module):
                     raise ValueError(f"`lights`[{name!r}] must have shape [n] or [colour, n].")
         self.materials, self.lights = dict(materials), dict(lights)
         self.points = None if points is None else _checks.vectors("points", points).reshape(-1, 3)
+        if self.points is not None and len(self.points) == 0:
+            raise ValueError("`points` must hold at least one position.")
 
 
 class Entry(NamedTuple):
@@ -160,7 +162,6 @@ class Path(eqx.Module):
 
     name: ClassVar[str]
     takes: ClassVar[type]
-    joins: ClassVar[bool] = False  # whether lights add up before it is called, so that more of them cost nothing
 
     @staticmethod
     @abc.abstractmethod
@@ -187,7 +188,6 @@ class Irradiance(Path):
 
     name = "irradiance"
     takes = Environment
-    joins = True
     coefficients: Float[Array, "*colour n"]
 
     @staticmethod
@@ -247,7 +247,6 @@ class Table(Path):
 
     name = "table"
     takes = Environment
-    joins = True
     lobes: Lobes
     coefficients: Float[Array, "*colour n"]
 
@@ -365,19 +364,17 @@ def plan(
         choices = {of: _choose(material, light, tolerance / margin, max_degree) for of, light in lights.items()}
         choices, hosts = _join(material, lights, choices, tolerance / margin)
         tables = _Tables(brdf, max(c.degree for c in choices.values()), views)
-        groups: dict[str, list[str]] = {}
         for of, choice in choices.items():
-            host = hosts.get(of, of)
-            groups.setdefault(host, []).append(of)
+            alone = hosts[of] == of
+            cost, joined = (choice.cost, "") if alone else (0.0, hosts[of])
             met = choice.error <= tolerance / margin
-            cost = choice.cost if host == of else 0.0
-            joined = "" if host == of else host
             entries.append(
                 Entry(name, of, choice.name(material), choice.degree, choice.error, choice.bound, cost, joined, met)
             )
         paths[name] = tuple(
-            choices[host].path.make(material, tables, [lights[of] for of in members], choices[host].degree)
-            for host, members in groups.items()
+            choice.path.make(material, tables, [lights[of] for of in choices if hosts[of] == host], choice.degree)
+            for host, choice in choices.items()
+            if hosts[host] == host
         )
     made = Plan(tuple(entries), float(tolerance), paths)
     if not made.met:
@@ -600,18 +597,19 @@ def _choose(material: _Material, light: _Seen, target: float, max_degree: int) -
 def _join(
     material: _Material, lights: dict[str, _Seen], choices: dict[str, _Choice], target: float
 ) -> tuple[dict[str, _Choice], dict[str, str]]:
-    """Distant lights in the paths of others, where they are good enough; and whose path, for each that joins."""
-    hosts: dict[str, str] = {}
-    for path in PATHS:
-        takers = [name for name, choice in choices.items() if choice.path is path]
-        if not path.joins or not takers:
-            continue
-        host = max(takers, key=lambda name: choices[name].degree)
-        for name, light in lights.items():
-            if name != host and name not in hosts and path.takes is light.kind:
-                joined = _judge(path, material, light, choices[host].degree)
-                if name in takers or joined.error <= target:
-                    choices, hosts = choices | {name: joined}, hosts | {name: host}
+    """Distant lights in the paths of others, where they are good enough; and whose path, for each light."""
+    hosts = {name: name for name in choices}
+    free = list(choices)
+    for path in (Table, Irradiance):
+        takers = [name for name in free if choices[name].path is path]
+        if takers:
+            host = max(takers, key=lambda name: choices[name].degree)
+            for name in free:
+                if lights[name].kind is path.takes:
+                    joined = _judge(path, material, lights[name], choices[host].degree)
+                    if name in takers or joined.error <= target:
+                        choices, hosts = choices | {name: joined}, hosts | {name: host}
+            free = [name for name in free if hosts[name] != host]
     return choices, hosts
 
 
