@@ -352,6 +352,7 @@ def plan(
     max_degree, views = _checks.integer("max_degree", max_degree), _checks.integer("views", views, 4)
     if max_degree > TABLE_DEGREE:
         raise ValueError(f"`max_degree` must be <= {TABLE_DEGREE}; got {max_degree}.")
+    tolerance = float(tolerance)
     if not tolerance > 0:
         raise ValueError(f"`tolerance` must be > 0; got {tolerance}.")
     if not margin >= 1:
@@ -376,7 +377,7 @@ def plan(
             for host, choice in choices.items()
             if hosts[host] == host
         )
-    made = Plan(tuple(entries), float(tolerance), paths)
+    made = Plan(tuple(entries), tolerance, paths)
     if not made.met:
         failed = [f"{e.material} under {e.light} ({100 * e.error:.2g} %)" for e in entries if not e.met]
         message = (
