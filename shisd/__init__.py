@@ -4,6 +4,7 @@ from shisd import decomposition as decomposition
 from shisd import domains as domains
 from shisd import harmonics as harmonics
 from shisd import models as models
+from shisd import planning as planning
 from shisd import shading as shading
 
 __version__ = "0.1.0"

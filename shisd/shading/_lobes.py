@@ -26,6 +26,8 @@ from shisd.harmonics._sh import weighted_sums
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 
+RIDGE = 1e-6  # of fits above the horizon
+
 
 class Lobes(eqx.Module):
     """RZH weights of a material's cosine-weighted slices, tabulated over local view directions (ISD15 Eq. 21).
@@ -140,7 +142,7 @@ def tabulate_brdf(
     azimuths: int | None = None,
     quadrature: int | None = None,
     domain: Literal["sphere", "upper"] = "sphere",
-    ridge: float = 1e-6,
+    ridge: float = RIDGE,
     tolerance: float = 1e-3,
     throw: bool = True,
 ) -> Lobes:
@@ -208,7 +210,7 @@ def _slices(
 
     @jax.checkpoint
     def project(view: Float[Array, "3"]) -> tuple[Array, Array]:
-        fine, coarse = (_project_slice(brdf, view, width, degree, q) for q in (quadrature, 3 * quadrature // 4))
+        fine, coarse = (project_slice(brdf, view, width, degree, q) for q in (quadrature, 3 * quadrature // 4))
         return fine, jnp.max(jnp.abs(fine - coarse))
 
     c, change = jax.lax.map(project, jnp.asarray(local.reshape(-1, 3), dtype))
@@ -216,10 +218,15 @@ def _slices(
     c = jnp.moveaxis(c.reshape(*nodes, *c.shape[1:]), range(len(nodes)), range(-1 - len(nodes), -1))  # colour first
     error = jax.lax.stop_gradient(jnp.max(change) / jnp.maximum(jnp.max(jnp.abs(c)), jnp.finfo(dtype).tiny))
     if ridge is not None:
-        modes, shares = _hemisphere_modes(degree)
-        modes = jnp.asarray(modes, dtype)
-        c = ((c @ modes) * jnp.asarray(1 / (shares + ridge), dtype).reshape((1,) * (c.ndim - 1) + (-1,))) @ modes.T
+        c = fit_above(c, ridge)
     return c, error
+
+
+def fit_above(c: Float[Array, "*batch n"], ridge: float) -> Float[Array, "*batch n"]:
+    """Expansions that fit functions above the horizon, from projections of these functions, which vanish below it."""
+    modes, shares = _hemisphere_modes(_checks.degree_of(c.shape[-1]))
+    modes = jnp.asarray(modes, c.dtype)
+    return ((c @ modes) * jnp.asarray(1 / (shares + ridge), c.dtype).reshape((1,) * (c.ndim - 1) + (-1,))) @ modes.T
 
 
 @functools.cache
@@ -229,19 +236,25 @@ def _hemisphere_modes(degree: int) -> tuple[np.ndarray, np.ndarray]:
     The eigenvectors of the matrix H of integrals of y_i y_j above the horizon, one block for every order m. With b the
     projection of a function that vanishes below, the least squares fit above, regularised, is (H + ridge)^-1 b.
     """
-    z, weight = _unit_gauss(degree + 1)
-    p = _tables.associated_legendre(np.arccos(z), degree)  # a product of two of one order is a polynomial of z
     modes, shares = np.zeros(((degree + 1) ** 2,) * 2), np.zeros((degree + 1) ** 2)
+    blocks = hemisphere_blocks(degree)
     for m in range(-degree, degree + 1):
         l = np.arange(abs(m), degree + 1)
-        rows = p[l, abs(m)]
-        values, vectors = np.linalg.eigh(2 * np.pi * (rows * weight) @ rows.T)
+        values, vectors = np.linalg.eigh(blocks[abs(m)])
         modes[np.ix_(l * l + l + m, l * l + l + m)] = vectors
         shares[l * l + l + m] = np.maximum(values, 0)
     return modes, shares
 
 
-def _project_slice(
+@functools.cache
+def hemisphere_blocks(degree: int) -> list[np.ndarray]:
+    """For every order m, integrals above the horizon of products of y_l^m, rows and columns l = m ... degree."""
+    z, weight = _unit_gauss(degree + 1)
+    p = _tables.associated_legendre(np.arccos(z), degree)  # a product of two of one order is a polynomial of z
+    return [2 * np.pi * (p[m:, m] * weight) @ p[m:, m].T for m in range(degree + 1)]
+
+
+def project_slice(
     brdf: AbstractBrdf, view: Float[Array, "3"], width: Scalar, degree: int, quadrature: int
 ) -> Float[Array, "*colour n"]:
     """SH coefficients of w -> value_cosine(w, view), bands 0 ... degree."""

@@ -171,7 +171,7 @@ def _shade(
 def _project(
     points: dict[str, Float[Array, "p 3"]], light: Light, basis: int | HaarBasis
 ) -> Float[Array, " p *colour_n"]:
-    incident = _incident(light)
+    incident = incident_radiance(light)
     product = None if isinstance(basis, HaarBasis) else _product(light, basis)
 
     def project(tile: dict[str, Array]) -> Float[Array, " p *colour_n"]:
@@ -222,7 +222,7 @@ def _constant(c: Float[Array, "n p"], v: Loop, solid_angle: Array, axes: Array, 
     return c[0] * (solid_angle * np.sqrt(1 / (4 * np.pi))) + _moments.fold(weights, axes, v, degree)
 
 
-def _incident(light: Light) -> Float[Array, "*colour_n"]:
+def incident_radiance(light: Light) -> Float[Array, "*colour_n"]:
     """SH coefficients of the radiance that comes through the outline, by the direction it comes from."""
     if isinstance(light, PortalLight):
         return light.coefficients
@@ -233,12 +233,12 @@ def _incident(light: Light) -> Float[Array, "*colour_n"]:
 
 
 def _constant_radiance(light: Light) -> Float[Array, "*colour 1"]:
-    return _incident(light) * np.sqrt(1 / (4 * np.pi))
+    return incident_radiance(light) * np.sqrt(1 / (4 * np.pi))
 
 
 def _product(light: Light, degree: int) -> Float[Array, "*colour_n_m"] | None:
     """From coefficients of a slice to those of slice times light; None where light is constant."""
-    incident = _incident(light)
+    incident = incident_radiance(light)
     light_degree = _checks.degree_of(incident.shape[-1])
     if light_degree == 0:
         return None

@@ -97,7 +97,7 @@ def exact_slices(brdf, light, normals, views):
         def pixel(normal, view):
             frame, theta = local_frames(normal, view)
             local = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-            c = _lobes._project_slice(brdf, local, jnp.asarray(brdf.lobe_width, float), degree, 32 + degree)
+            c = _lobes.project_slice(brdf, local, jnp.asarray(brdf.lobe_width, float), degree, 32 + degree)
             return jnp.asarray(light, float) @ harmonics.rotate(c, frame)
 
         return np.asarray(jax.lax.map(lambda nv: pixel(*nv), (jnp.asarray(normals, float), jnp.asarray(views, float))))

@@ -311,7 +311,7 @@ def sparse_table(brdf, degree, count):
 
     def choose(theta):
         view = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-        c = _lobes._project_slice(brdf, view, width, degree, 48)
+        c = _lobes.project_slice(brdf, view, width, degree, 48)
         weights, axes = decomposition.sparse_weights(basis, c, count)
         return decomposition.ZonalLobes(basis.directions[axes], weights[..., axes])
 

@@ -1,0 +1,75 @@
+"""Radiance from distant light that is symmetric about an axis: a sky gradient, a cap, a sun, a constant.
+
+By the addition theorem a zonal light sum_l z_l y_l^0(w . a) has the coefficients pi_l z_l y_l^m(a), so in the local
+frame they are harmonics at the local direction of the axis: nothing is rotated.
+
+notation: a = axis; z_l = coefficients of the zonal light; pi_l = sqrt(4 pi/(2l+1)); R = (t, b, n) local to world.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from shisd import _checks
+from shisd._numerics import normalize, times
+from shisd._sharding import by_device
+from shisd._typing import Array, Float
+from shisd.harmonics import _tables, sh_basis
+from shisd.shading._lobes import Lobes, lookup_table, slice_values
+from shisd.shading._surface import shade_points, shade_tiles, surface
+
+
+def shade_zonal(
+    lobes: Lobes,
+    axis: ArrayLike,
+    zonal_coefficients: ArrayLike,
+    normals: ArrayLike,
+    views: ArrayLike,
+    tangents: ArrayLike | None = None,
+) -> Float[Array, "*batch_colour"]:
+    """Radiance that leaves surface points towards the viewer under distant light that is symmetric about an axis.
+
+    Arguments: `lobes` from `tabulate_brdf`; `axis` [3] in world space, of any length but zero; `zonal_coefficients`
+    [*colour, L+1], those of y_l^0 about it; the others and what is returned as in `shade_environment`.
+    Derivatives: in every floating argument, both modes, any order.
+    Accuracy: that of `shade_environment` with the same light.
+    Cost: (L+1)^2 harmonics per pixel where `shade_environment` rotates, about L^3 products.
+    Source: ISD15 Eq. 4 and 22, for a light that is one rotated zonal function.
+    """
+    if not isinstance(lobes, Lobes):
+        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
+    if lobes.domain != "sphere":
+        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
+    a, z = _checks.vectors("axis", axis), _checks.real_array("zonal_coefficients", zonal_coefficients)
+    if a.ndim != 1:
+        raise ValueError(f"`axis` must have shape [3]; got {list(a.shape)}.")
+    if z.ndim not in (1, 2) or z.shape[-1] == 0:
+        raise ValueError(f"`zonal_coefficients` must have shape [L+1] or [colour, L+1]; got {list(z.shape)}.")
+    light = [("zonal_coefficients", z.shape[:-1])]
+    lobes, points, colour = surface(lobes, tangents, light, [a.dtype, z.dtype], normals=normals, views=views)
+    dtype = lobes.weights.dtype
+    z = z[..., : lobes.degree + 1].astype(dtype)
+    return by_device(shade_points, points, _shade, lobes, normalize(a.astype(dtype)), z, colour)
+
+
+@eqx.filter_jit
+def _shade(
+    points: dict[str, Float[Array, "p 3"]],
+    lobes: Lobes,
+    axis: Float[Array, "3"],
+    z: Float[Array, "*c l"],
+    colour: tuple[int, ...],
+) -> Float[Array, " p *colour"]:
+    degree = z.shape[-1] - 1
+    bands = _tables.bands(degree)
+    z = (z / jnp.broadcast_to(jnp.asarray(_tables.zonal_norms(degree), z.dtype), z.shape))[..., np.asarray(bands)]
+
+    table = lookup_table(lobes, degree)
+
+    def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
+        slices = slice_values(table, local, lobes)
+        y = sh_basis(jnp.einsum("pij,i->pj", frame, axis), degree).T
+        return jnp.sum(times(slices, times(z[..., None], y)), axis=-2)
+
+    return shade_tiles(lobes, points, colour, 1024, radiance)

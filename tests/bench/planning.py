@@ -1,0 +1,150 @@
+"""What `planning` predicts against what quadrature measures, and what a plan saves."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+
+from shisd import decomposition, models, planning, reference, shading
+from tests.bench.lobes import load_map
+from tests.bench.timing import interleaved
+from tests.models.materials import GOLD_PAINT
+
+HEIGHT = 64  # rows of the maps: quadrature over every texel stays affordable
+LAMP = np.array([[-0.5, -0.5, 1.5], [-0.5, 0.5, 1.5], [0.5, 0.5, 1.5], [0.5, -0.5, 1.5]], np.float32)
+RADIUS = 0.5  # of the ball on which positions are
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def materials():
+    return {
+        "clay": models.Lambertian(np.array([0.75, 0.6, 0.5])),
+        "red plastic": models.CookTorrance(0.5, 0.0, np.array([0.6, 0.06, 0.05])),
+        "copper": models.CookTorrance(0.45, 1.0, np.array([0.95, 0.64, 0.54])),
+        "gold paint": models.SgdMicrofacet(**{name: np.asarray(value) for name, value in GOLD_PAINT.items()}),
+    }
+
+
+def small_map(name):
+    texels = load_map(name).texels
+    step = texels.shape[0] // HEIGHT
+    return models.Environment(texels.reshape(HEIGHT, step, 2 * HEIGHT, step, 3).mean(axis=(1, 3)))
+
+
+def sky():
+    gradient = lambda d: (1 + d[:, 2:]) * jnp.asarray([[0.5, 0.7, 1.0]], d.dtype)
+    return models.Environment.from_function(gradient, HEIGHT)
+
+
+def pixels(count, seed=0):
+    """Positions, normals, views: mirror directions and elevations of views spread evenly, the rest at random.
+
+    A few bright texels seen in grazing reflection make most of the mean square, so a random choice would need many
+    more pixels.
+    """
+    rng = np.random.default_rng(seed)
+    i = np.arange(count)
+    z, phi = 1 - (2 * i + 1) / count, np.pi * (np.sqrt(5) - 1) * i
+    mirror = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
+    sine = np.sqrt((rng.permutation(count) + 0.5) / count)[:, None]
+    side = unit(np.cross(mirror, unit(rng.normal(size=(count, 3)))))
+    normals = np.sqrt(1 - sine**2) * mirror + sine * side
+    views = 2 * np.sqrt(1 - sine**2) * normals - mirror
+    return tuple(np.asarray(a, np.float32) for a in (RADIUS * normals, normals, views))
+
+
+def relative(got, truth):
+    return float(np.sqrt(np.mean((np.asarray(got) - truth) ** 2) / np.mean(np.square(truth))))
+
+
+def truth_of(brdf, light, where):
+    if isinstance(light, models.Environment):
+        return np.asarray(reference.shade_environment_quadrature(brdf, light, *where[1:]))
+    return np.asarray(reference.shade_polygon_quadrature(brdf, light.points, light.emission, *where, nodes=24))
+
+
+def general(brdf, light, degree, views=64):
+    """A function of pixels: one light by the path that always works."""
+    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+    if isinstance(light, models.PolygonLight):
+        lobes = shading.tabulate_brdf(brdf, basis, views=views, domain="upper", throw=False)
+        return lambda p, n, v: shading.shade_polygon(lobes, light, p, n, v)
+    lobes = shading.tabulate_brdf(brdf, basis, views=views, throw=False)
+    e = light.coefficients(degree) if isinstance(light, models.Environment) else light
+    return lambda p, n, v: shading.shade_environment(lobes, e, n, v)
+
+
+def bench_prediction(degrees=(2, 4, 8, 16, 24), count=1024, names=("interior", "studio")):
+    """Relative RMS error of truncation at a degree: predicted from band energies, and measured.
+
+    Maps of 64 x 128 and a square lamp, pixels turned in all ways. Measured against quadrature of the material itself;
+    bound: the RMS that no choice of rotations exceeds.
+    """
+    rows = []
+    lights = {name: small_map(name) for name in names} | {"lamp": models.PolygonLight(LAMP, np.float32([3, 2, 1]))}
+    where = pixels(count)
+    reference_degree = 60
+    seen = {name: planning._seen(name, x, jnp.asarray(where[0][::80]), reference_degree) for name, x in lights.items()}
+    for material, brdf in materials().items():
+        known = planning._material(brdf, reference_degree, 64)
+        for name, light in lights.items():
+            truth = truth_of(brdf, light, where)
+            path = planning.Polygon if name == "lamp" else planning.Table
+            for degree in degrees:
+                judged = planning._judge(path, known, seen[name], degree)
+                measured = relative(general(brdf, light, degree)(*where), truth)
+                rows.append({
+                    "material": material,
+                    "light": name,
+                    "degree": degree,
+                    "predicted %": 100 * judged.error,
+                    "measured %": 100 * measured,
+                    "predicted / measured": judged.error / measured,
+                    "bound %": 100 * judged.bound,
+                })  # fmt: skip
+                print(rows[-1], flush=True)
+    return rows
+
+
+def bench_saving(tolerances=(0.1, 0.05), count=16384, judged=512):
+    """What a plan saves in a mixed scene against the general path at one safe degree, the largest of the plan.
+
+    Clay, red plastic, copper and gold paint under the interior, a sky gradient and a lamp; 16384 pixels of each. Added
+    up: the same with both distant lights as one. Errors: the worst of the materials under all lights, against
+    quadrature.
+    """
+    rows = []
+    lamp = models.PolygonLight(LAMP, np.float32([3, 2, 1]))
+    lights = {"interior": small_map("interior"), "sky": sky(), "lamp": lamp}
+    where, few = pixels(count), pixels(judged, seed=1)
+    for tolerance in tolerances:
+        made = planning.plan(planning.Scene(materials(), lights, where[0][:: count // 12]), tolerance)
+        degree = max(entry.degree for entry in made.entries)
+        both = sum(light.coefficients(degree) for light in list(lights.values())[:2])
+        separate, added = {}, {}
+        for name, brdf in materials().items():
+            calls = [general(brdf, light, degree) for light in lights.values()]
+            separate[name] = lambda *w, calls=calls: sum(call(*w) for call in calls)
+            calls = [general(brdf, both, degree), calls[2]]
+            added[name] = lambda *w, calls=calls: sum(call(*w) for call in calls)
+        planned = {name: functools.partial(made.shade, name) for name in separate}
+        ways = {"plan": planned, "one degree": separate, "one degree, added up": added}
+        every = {way: lambda *w, each=each: [shade(*w) for shade in each.values()] for way, each in ways.items()}
+        times = interleaved(every, *(jnp.asarray(a) for a in where), seconds=5.0)
+        truths = {n: sum(truth_of(b, light, few) for light in lights.values()) for n, b in materials().items()}
+        print(made, flush=True)
+        for way, each in ways.items():
+            rows.append({
+                "tolerance %": 100 * tolerance,
+                "way": way,
+                "degrees": " ".join(str(e.degree) for e in made.entries) if way == "plan" else str(degree),
+                "met": made.met,
+                "us per pixel, all materials": times[way].median / count * 1e6,
+                "time / plan": times[way].median / times["plan"].median,
+                "worst error %": 100 * max(relative(each[name](*few), truth) for name, truth in truths.items()),
+            })  # fmt: skip
+            print(rows[-1], flush=True)
+    return rows

@@ -1,0 +1,61 @@
+"""Zonal light against the same light as coefficients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from shisd import decomposition, harmonics, models, shading
+from tests.hard_cases import unit
+
+DEGREE = 5
+MATERIALS = {"glossy": models.Ggx(0.4, 0.3), "brushed": models.Ggx(np.float32([0.3, 0.6]), np.float32([0.9, 0.6, 0.3]))}
+
+
+def tabulate(brdf):
+    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(DEGREE), DEGREE)
+    return shading.tabulate_brdf(brdf, basis, views=16, azimuths=16)
+
+
+def scene(rng, count, dtype):
+    normals, views, tangents = unit(rng.normal(size=(3, count, 3)))
+    views *= np.where(np.sum(views * normals, axis=1) < 0, -1, 1)[:, None]
+    axis, z = 2 * unit(rng.normal(size=3)), rng.normal(size=(3, DEGREE + 1))
+    return tuple(a.astype(dtype) for a in (axis, z, normals, views, tangents))
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_it_is_the_light_of_these_coefficients(material, dtype, rng):
+    lobes = tabulate(MATERIALS[material])
+    axis, z, *where = scene(rng, 200, dtype)
+    where[1][0], where[0][1] = where[0][0], axis  # a view along the normal, a normal along the axis
+    e = harmonics.convolve(harmonics.sh_basis(axis, DEGREE)[None], z)
+    expected = shading.shade_environment(lobes, e, *where)
+    got = shading.shade_zonal(lobes, axis, z, *where)
+    assert got.dtype == dtype and got.shape == (200, 3)
+    np.testing.assert_allclose(got, expected, atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)))
+    low = shading.shade_zonal(lobes, axis, z[0, :3], *where)
+    np.testing.assert_allclose(
+        low,
+        shading.shade_environment(lobes, e[0, :9], *where),
+        atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)),
+    )
+
+
+def test_derivatives(x64, rng):
+    lobes = tabulate(MATERIALS["glossy"])
+    arguments = tuple(jnp.asarray(a) for a in scene(rng, 3, np.float64)[:4])
+    radiance = jax.jit(lambda *a: shading.shade_zonal(lobes, *a))
+    check_grads(radiance, arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
+
+
+def test_errors_name_the_argument(as_user, rng):
+    axis, z, normals, views, _ = scene(rng, 2, np.float32)
+    lobes = tabulate(MATERIALS["glossy"])
+    with pytest.raises(ValueError, match=r"`axis` must have shape \[3\]; got \[1, 3\]"):
+        shading.shade_zonal(lobes, axis[None], z, normals, views)
+    with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape"):
+        shading.shade_zonal(lobes, axis, z[None], normals, views)
+    with pytest.raises(ValueError, match="`lobes` must come from shading.tabulate_brdf"):
+        shading.shade_zonal(1, axis, z, normals, views)
