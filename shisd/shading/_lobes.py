@@ -184,7 +184,12 @@ def tabulate_brdf(
 
 @eqx.filter_jit
 def _decompose(
-    c: Array, error: Scalar, basis: RotatedZonalBasis, tolerance: float | None, isotropic: bool, domain: str
+    c: Array,
+    error: Scalar,
+    basis: RotatedZonalBasis,
+    tolerance: float | None,
+    isotropic: bool,
+    domain: Literal["sphere", "upper"],
 ) -> Lobes:
     """What may refuse, apart from what takes long to compile: JAX does not store compiled code that can raise."""
     if tolerance is not None:
