@@ -7,14 +7,15 @@ RUN := $(VENV)/bin/python
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint bench clean
+.PHONY: help demo test test-slow lint report bench clean
 
 help:
 	@echo "make demo       relight two objects with real maps; pictures and a table go to output/relight"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests: examples, notebooks, convergence"
 	@echo "make lint       ruff and pyright"
-	@echo "make bench      speed against error, beside other methods"
+	@echo "make report     speed against error, beside other methods; QUICK=1 for a few of them; to output/report"
+	@echo "make bench      studies behind the choices of the library: axes, kernels, recurrences"
 	@echo "make clean      remove .venv and output"
 
 demo: $(VENV)/.demo
@@ -30,9 +31,13 @@ lint: $(VENV)/.test
 	$(RUN) -m ruff check .
 	$(RUN) -m pyright --pythonpath $(RUN)
 
+ALLOCATOR := MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000
+
+report: $(VENV)/.bench
+	$(ALLOCATOR) $(RUN) -m tests.bench.report $(if $(QUICK),--quick,--readme)
+
 bench: $(VENV)/.test
-	MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000 \
-	  $(RUN) -m tests.bench.run --readme
+	$(ALLOCATOR) $(RUN) -m tests.bench.run --readme
 
 clean:
 	rm -rf $(VENV) output
@@ -47,6 +52,11 @@ $(VENV)/.test: pyproject.toml | $(VENV)/.created
 	@echo "Installing what the tests need into $(VENV)/ ..."
 	@$(RUN) -m pip install --quiet --disable-pip-version-check -e '.[test]'
 	@touch $@ $(VENV)/.demo
+
+$(VENV)/.bench: pyproject.toml | $(VENV)/.created
+	@echo "Installing what the report compares with into $(VENV)/ ..."
+	@$(RUN) -m pip install --quiet --disable-pip-version-check -e '.[bench]'
+	@touch $@ $(VENV)/.test $(VENV)/.demo
 
 $(VENV)/.created:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \

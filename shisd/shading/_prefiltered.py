@@ -44,18 +44,17 @@ _CHART_X = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # world to the chart w
 class PrefilteredLobes(eqx.Module):
     """A material under one distant light, as `prefilter` makes it: `channels` terms, predicted relative `error`.
 
-    `profiles` [V+4, C * colours], splines of a over the elevation of the view; `maps` [texels, M * colours], splines of
-    U and V over two charts; `channel` and `order` [M], of every map; `reduce` and `expand` [C, L+1], from the bands of
-    a slice to channels and back; `mirror`, whether s is the mirror direction. C and M are padded, with zeros, so that
-    most materials share compiled code.
+    `maps` [texels, M * colours], splines of U and V over two charts, and `profiles` [V+4, M * colours], those of a over
+    the elevation of the view; `order` [M] of the maps, negative for V; `reduce` and `expand` [M, L+1], from the bands
+    of a slice to a and back; `mirror`, whether s is the mirror direction. M is padded, with zeros, so that most
+    materials share compiled code.
     """
 
     profiles: Float[Array, "elevations a"]
     maps: Float[Array, "texels b"]
-    channel: Array
     order: Array
-    reduce: Float[Array, "channels l"]
-    expand: Float[Array, "channels l"]
+    reduce: Float[Array, "maps l"]
+    expand: Float[Array, "maps l"]
     mirror: Array
     channels: Array
     error: Scalar
@@ -111,7 +110,7 @@ def prefilter(
     like = jax.lax.stop_gradient(_as_type(like, dtype))
     profiles, maps = _filter(c, e.reshape(-1, e.shape[-1]), like)
     return PrefilteredLobes(
-        profiles, maps, like.channel, like.order, like.reduce, like.expand, like.mirror, like.channels, like.error,
+        profiles, maps, like.order, like.reduce, like.expand, like.mirror, like.channels, like.error,
         like.highest, (lobes.colour, e.shape[:-1]),
     )  # fmt: skip
 
@@ -161,14 +160,12 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
         orders, *rest = _channels(np.asarray(_centred(jnp.asarray(c), mirror)) * share, np.sqrt(energy), tolerance)
         found.append((len(orders) + np.count_nonzero(orders), mirror, orders, *rest))
     _, mirror, m, error, reduce, expand = min(found, key=lambda x: x[0])
-    turning = np.flatnonzero(m > 0)
-    channel, order = np.concatenate([np.arange(len(m)), turning]), np.concatenate([m, -m[turning]])
-    spare = 4 - len(m) % 4  # channels of nothing, at least one, of which the spare maps are
-    fill = lambda x: jnp.asarray(np.pad(x, (0, -len(x) % 8), constant_values=len(m)), jnp.int32)
-    rows = lambda x: jnp.asarray(np.pad(x, ((0, spare), (0, 0))), float)
+    turning = np.flatnonzero(m > 0)  # these have a V
+    order, reduce, expand = (np.concatenate([x, y[turning]]) for x, y in ((m, -m), (reduce, reduce), (expand, expand)))
+    pad = lambda x: np.pad(x, ((0, -len(x) % 8), *[(0, 0)] * (x.ndim - 1)))
     highest, none = min(-(-int(m.max()) // 4) * 4, degree), jnp.zeros((0, 0))
     return PrefilteredLobes(
-        none, none, fill(channel), jnp.where(fill(channel) < len(m), fill(order), 0), rows(reduce), rows(expand),
+        none, none, jnp.asarray(pad(order), jnp.int32), *(jnp.asarray(pad(x), float) for x in (reduce, expand)),
         jnp.asarray(mirror), jnp.asarray(len(m), jnp.int32), jnp.asarray(error, float), highest, ((), ()),
     )  # fmt: skip
 
@@ -212,11 +209,11 @@ def _centred(c: Float[Array, "s v n"], mirror: bool | Array) -> Float[Array, "n 
 def _filter(c: Float[Array, "s v n"], e: Float[Array, "s2 n"], like: PrefilteredLobes) -> tuple[Array, Array]:
     """`profiles` and `maps` of `PrefilteredLobes`."""
     degree = like.degree
-    m = jnp.zeros(len(like.reduce), jnp.int32).at[like.channel].max(like.order)
+    m = jnp.abs(like.order)
     a = _of_orders(like.reduce, m, degree) @ _centred(c, like.mirror).reshape(c.shape[-1], -1)
     a = jnp.swapaxes(a.reshape(len(m), *c.shape[:2]), 0, 1)
-    profiles = _views.spline_table(a, m)  # [s, channels, V+4]
-    combine = _of_orders(like.expand[like.channel], like.order, degree)
+    profiles = _views.spline_table(a, m)  # [s, maps, V+4]
+    combine = _of_orders(like.expand, like.order, degree)
     charts = [e, rotate(e, jnp.asarray(_CHART_X, e.dtype))]
     maps = jnp.concatenate([_chart(x, combine, like.order, degree) for x in charts])
     return jnp.moveaxis(profiles, -1, 0).swapaxes(1, 2).reshape(profiles.shape[-1], -1), maps
@@ -264,10 +261,12 @@ def _chart(e: Float[Array, "s n"], combine: Array, m: Array, degree: int) -> Flo
 
 @eqx.filter_jit
 def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> Float[Array, " p *colour"]:
-    channel, order = lobes.channel, lobes.order
     material, light = (int(np.prod(c)) for c in lobes.colours)
     rows, first, kept = _grid(lobes.degree)
-    width = 2 * rows + 4
+    width, count = 2 * rows + 4, len(lobes.order)
+    k = np.arange(lobes.highest + 1)[:, None]  # indexed copies and jnp.sum would be slow: both are products
+    choose = jnp.concatenate([k == lobes.order[None], -k == lobes.order[None]]).astype(lobes.maps.dtype)
+    sums = jnp.tile(jnp.eye(max(material, light), dtype=lobes.maps.dtype), (count, 1))
 
     def shade(tile: dict[str, Array]) -> Float[Array, " p *colour"]:
         n, v = normalize(tile["normals"]), normalize(tile["views"])
@@ -294,11 +293,10 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
             jnp.arctan2(safe_sqrt(1 - cosine * cosine), cosine) * ((lobes.profiles.shape[0] - 4) * 2 / np.pi) - 0.5
         )
         elevation = jnp.clip(elevation + 1, 0, lobes.profiles.shape[0] - 4)
-        a = _lookup(lobes.profiles, elevation, list(enumerate(weight))).reshape(-1, lobes.reduce.shape[0], material)
-        waves = jnp.where((order >= 0)[:, None], cos[jnp.abs(order)], sin[jnp.abs(order)]).T  # [p, maps]
-        terms = waves[..., None] * a[:, channel] * looked.reshape(-1, len(order), light)
-        sums = jnp.tile(jnp.eye(terms.shape[-1], dtype=a.dtype), (len(order), 1))  # a product: jnp.sum is slow here
-        total = terms.reshape(-1, sums.shape[0]) @ sums
+        a = _lookup(lobes.profiles, elevation, list(enumerate(weight))).reshape(-1, count, material)
+        waves = jnp.concatenate([cos, sin]).T @ choose
+        terms = waves[..., None] * a * looked.reshape(-1, count, light)
+        total = terms.reshape(-1, count * terms.shape[-1]) @ sums
         total = jnp.where((cosine < 0)[:, None], 0, total)
         return total.reshape(-1, *np.broadcast_shapes(*lobes.colours))
 

@@ -3,7 +3,8 @@
 The reference is quadrature over every texel, each in four parts, in float64 (`shisd.reference`): python -m
 tests.bench.environments --make. Its error is the difference to sixteen parts, of a few pixels.
 
-ours: slices on rotated zonal harmonics, `shading.shade_environment`; for clay also its irradiance, ISD15 Eq. 13.
+ours: slices on rotated zonal harmonics, `shading.shade_environment`; maps filtered for the material,
+`shading.shade_prefiltered`; for clay also its irradiance, ISD15 Eq. 13.
 Monte Carlo, point lights: tests/bench/monte_carlo.py. SH rotation: tests/bench/sh_rotation.py, on the same slices.
 Split sum: tests/bench/split_sum.py. Spherical Gaussians: tests/bench/lobes.py.
 Gradients: value and derivatives in normals, views, and the light's coefficients, texels or filtered texels, of a sum
@@ -166,12 +167,42 @@ def shisd(scene: Scene) -> list[Method]:
         forward, gradient = functions(shade, "light")
         methods.append(Method("shisd", f"degree {degree}", forward, parameters, gradient, **own))
     if not scene.glossy:
-        for degree in (2, 4):
+        for degree in (2, 4, 8):
             zonal = by_degree[degree].slice_coefficients(jnp.asarray([0.0, 0.0, 1.0], jnp.float32))
             zonal = zonal[:, np.arange(degree + 1) * np.arange(1, degree + 2)]
             parameters = {"light": light[:, : (degree + 1) ** 2], "zonal": zonal}
             forward, gradient = functions(shade_diffuse, "light")
             methods.append(Method("shisd, irradiance", f"degree {degree}", forward, parameters, gradient, **own))
+    return methods
+
+
+@functools.cache
+def sharp_table(material: str, degree: int):
+    """Lobes of a higher degree, and seconds."""
+    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+    brdf = MATERIALS[material]
+    return timed(f"{type(brdf).__name__} {degree}", lambda: shading.tabulate_brdf(brdf, basis, quadrature=64 + degree))
+
+
+def shade_prefiltered(parameters, normals, views):
+    filtered = eqx.tree_at(lambda x: x.maps, parameters["filtered"], parameters["maps"])
+    return shading.shade_prefiltered(filtered, normals, views)
+
+
+def prefiltered(scene: Scene) -> list[Method]:
+    methods = []
+    for degree in (30,) if scene.quick or scene.material != "GGX 0.1" else (30, 64):
+        lobes, seconds = sharp_table(scene.material, degree)
+        light = coefficients(scene.map)[0][:, : (degree + 1) ** 2]
+        for tolerance in scene.some((0.1, 0.03, 0.01, 0.003) if scene.glossy else (0.01,)):
+            make = functools.partial(shading.prefilter, lobes, light, tolerance=tolerance)
+            first = make()
+            filtered, filtering = timed(f"prefilter {degree} {first.maps.shape}", make)
+            parameters = {"filtered": filtered, "maps": filtered.maps}
+            forward, gradient = functions(shade_prefiltered, "maps")
+            setting = f"tolerance {tolerance:g}"
+            own = {"setup": seconds + filtering, "ours": True}
+            methods.append(Method(f"shisd, filtered {degree}", setting, forward, parameters, gradient, **own))
     return methods
 
 
@@ -308,7 +339,7 @@ def gaussians(scene: Scene) -> list[Method]:
     return methods
 
 
-FAMILIES = (shisd, estimators, fixed_lights, rotations, split_sums, gaussians)
+FAMILIES = (shisd, prefiltered, estimators, fixed_lights, rotations, split_sums, gaussians)
 
 
 def tasks(quick: bool) -> list[Task]:

@@ -1,10 +1,11 @@
 """Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--readme].
 
 Writes DIR/report.json with every row, DIR/report.md with tables, and a figure for each group of tasks; --readme also
-puts tables and figures into the README. `make report` sets the allocator as `make bench` does.
+puts both into examples/ and the short tables between the README's markers. `make report` sets the allocator.
 """
 
 import argparse
+import inspect
 import json
 import os
 import time
@@ -73,39 +74,52 @@ def main() -> None:
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
     results, sections, start = {"machine": note, "rows": []}, {}, time.perf_counter()
 
-    def keep(name: str, text: str) -> None:
-        sections[name] = text
-        print(f"{text}\n\n[{time.perf_counter() - start:.0f} s]\n", flush=True)
+    def keep(name: str, short: str, long: str) -> None:
+        sections[name] = short, long
+        print(f"{long}\n\n[{time.perf_counter() - start:.0f} s]\n", flush=True)
 
+    folders = [arguments.output, *([Path("examples")] if arguments.readme else [])]
     for name, (title, make) in GROUPS.items():
         if name not in wanted:
             continue
         panels: dict[str, dict[str, list[dict]]] = {}
         for task in make(arguments.quick):
-            rows = harness.run(task, seconds=0.05 if arguments.quick else 0.25)
+            rows = harness.run(task, seconds=0.05 if arguments.quick else 0.2)
             panels.setdefault(task.item, {})[task.title] = rows
             results["rows"] += rows
             print(f"{task.title}: {len(rows)} methods, {time.perf_counter() - start:.0f} s", flush=True)
-        parts = [f"{title}: relative RMSE of every method, and what it costs. {note}"]
+        if not panels:
+            continue
+        short, long = [], [f"## {title}"]
         for item, of_item in panels.items():
             file = f"{name}.png" if len(panels) == 1 else f"{name}_{item}.png"
-            folders = [arguments.output, *([Path("examples")] if arguments.readme else [])]
             for folder in folders:
                 harness.draw(of_item, item, folder / file)
-            parts.append(f"![Error against time: {title}, by {item}](examples/{file})")
-            parts.append(table(summary(of_item, item)))
-            parts.append("Time over ours at equal error, where that is least (settings with errors below 10 %):")
-            parts.append(table(leads(of_item, item)))
-        keep(name, "\n\n".join(parts))
+            lead = "Time over ours at equal error, where that is least, and that error; errors from 10 % to our least."
+            short.append(f"![{title}: relative error against us per {item}](examples/{file})\n\n{lead}")
+            short.append(table(leads(of_item, item)))
+            long.append(f"![{title}: relative error against us per {item}]({file})\n\n{lead}")
+            long.append(table(leads(of_item, item)))
+            long.append("Every method: medians of its costs, and its relative RMSE in each task.")
+            long.append(table(summary(of_item, item)))
+        if name == "renderers":
+            equal = [line for rows in panels["pixel"].values() for line in renderers.equal_error(rows)]
+            short = [f"{inspect.cleandoc(renderers.__doc__ or '')}", table(equal)]
+            long += ["What the renderer takes for our error:", table(equal)]
+        notes = {"spherical": spherical.notes, "renderers": renderers.notes}.get(name, list)()
+        keep(name, "\n\n".join([*short, *notes, note]), "\n\n".join([*long, *notes]))
     for name, make in TABLES.items():
-        if name in wanted:
-            made = make(arguments.quick)
+        if name in wanted and (made := make(arguments.quick)):
             results[name] = made
-            keep(name, "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in made.items()) + f"\n\n{note}")
+            text = "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in made.items())
+            keep(name, f"{text}\n\n{note}", text)
+    report = "\n\n".join(["# Speed against error", note, *(long for _, long in sections.values())]) + "\n"
     (arguments.output / "report.json").write_text(json.dumps(results, indent=1))
-    (arguments.output / "report.md").write_text("\n\n".join(sections.values()) + "\n")
-    for name, text in sections.items() if arguments.readme else ():
-        paste(name, text)
+    for folder in folders:
+        (folder / "report.md").write_text(report)
+    for name, (short, _) in sections.items() if arguments.readme else ():
+        if f"<!-- table:{name} -->" in Path("README.md").read_text():
+            paste(name, short)
     print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")
 
 
