@@ -1,12 +1,11 @@
 """Radiance from distant light: ISD15 Eq. 22 for batches of normals and views.
 
 Eq. 22 sums, over rotated axes R z_k and bands, the lobe weights times the light convolved with that band's zonal
-harmonic. By the addition theorem this is the product of the lobe's coefficients with the light's coefficients in the
-local frame. On a CPU the latter is fastest: turning the light is two products with constant matrices, shared by every
-lobe axis, where Eq. 22 as it stands evaluates (L+1)^2 harmonics at 2L+1 axes per pixel. tests/bench compares the
-candidates.
+harmonic. By the addition theorem this is the product of the lobe's coefficients, turned to the world, with the light's
+(`harmonics._pairing`). On a CPU that is fastest: Eq. 22 as it stands evaluates (L+1)^2 harmonics at 2L+1 axes per
+pixel, and to turn the light is to turn three colours. tests/bench compares the candidates.
 
-notation: R = (t, b, n) local to world; e = light coefficients; R^T e = light in the local frame.
+notation: R = (t, b, n) local to world; e = light coefficients.
 """
 
 import equinox as eqx
