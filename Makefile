@@ -34,7 +34,7 @@ lint: $(VENV)/.test
 ALLOCATOR := MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000
 
 report: $(VENV)/.bench
-	$(ALLOCATOR) $(RUN) -m tests.bench.report $(if $(QUICK),--quick,--readme)
+	$(ALLOCATOR) $(RUN) -m tests.bench.report $(if $(QUICK),--quick)
 
 bench: $(VENV)/.test
 	$(ALLOCATOR) $(RUN) -m tests.bench.run --readme

@@ -246,11 +246,12 @@ def _chart(e: Float[Array, "s n"], combine: Array, m: Array, degree: int) -> Flo
 
     values = jax.lax.map(jax.checkpoint(row), frames)  # [rows, 2 rows, maps, s]
     # past a pole: the other side, in a frame turned by half a turn
-    sign = jnp.where(m % 2 == 0, 1, -1)[:, None].astype(e.dtype)
+    sign = jnp.where(m % 2 == 0, 1, -1)[None, None, :, None].astype(e.dtype)
     around = jnp.concatenate([values, jnp.roll(values[::-1], rows, axis=1) * sign])
     k = np.fft.fftfreq(2 * rows) * 2 * np.pi
     symbol = (2 + np.cos(k)) / 3
-    spectrum = jnp.fft.fft2(around, axes=(0, 1)) / jnp.asarray(np.outer(symbol, symbol)[..., None, None], e.dtype)
+    spectrum = jnp.fft.fft2(around, axes=(0, 1))
+    spectrum *= jnp.asarray(1 / np.outer(symbol, symbol)[..., None, None], spectrum.dtype)
     splines = jnp.fft.ifft2(spectrum, axes=(0, 1)).real
     columns = np.arange(-2, 2 * rows + 2) % (2 * rows)
     return splines[first : first + kept][:, columns].reshape(kept * len(columns), -1)
@@ -264,7 +265,9 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
     material, light = (int(np.prod(c)) for c in lobes.colours)
     rows, first, kept = _grid(lobes.degree)
     width, count = 2 * rows + 4, len(lobes.order)
-    k = np.arange(lobes.highest + 1)[:, None]  # indexed copies and jnp.sum would be slow: both are products
+    k = np.arange(lobes.highest + 1, dtype=np.int32)[
+        :, None
+    ]  # indexed copies and jnp.sum would be slow: both are products
     choose = jnp.concatenate([k == lobes.order[None], -k == lobes.order[None]]).astype(lobes.maps.dtype)
     sums = jnp.tile(jnp.eye(max(material, light), dtype=lobes.maps.dtype), (count, 1))
 
@@ -285,7 +288,9 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
         )
         row, weight = _cubic(jnp.arctan2(rho, s[:, 2]) * (rows / np.pi) - 0.5)
         column, weight_2 = _cubic((jnp.arctan2(s[:, 1], s[:, 0]) % (2 * np.pi)) * (rows / np.pi) - 0.5)
-        corner = (jnp.clip(row - 1 - first, 0, kept - 4) + kept * polar) * width + jnp.clip(column + 1, 0, width - 4)
+        corner = (jnp.clip(row - 1 - first, 0, kept - 4) + jnp.where(polar, kept, 0)) * width + jnp.clip(
+            column + 1, 0, width - 4
+        )
         looked = _lookup(
             lobes.maps, corner, [(i * width + j, a * b) for i, a in enumerate(weight) for j, b in enumerate(weight_2)]
         )

@@ -58,7 +58,7 @@ class Scene:
     @property
     def with_gradients(self):
         """Whether gradients are asked for: what they cost depends on no map and not on the kind of gloss."""
-        return self.map == "interior" and self.material in ("clay", "GGX 0.25")
+        return not self.quick and self.map == "interior" and self.material in ("clay", "GGX 0.25")
 
     @property
     def glossy(self):

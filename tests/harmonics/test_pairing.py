@@ -43,6 +43,7 @@ def test_products_with_turned_expansions(degree, colours, dtype, rng):
     np.testing.assert_allclose(got, expected, atol=(1e-6 if dtype == "float32" else 1e-14) * scale * (degree + 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["identity", "half turn", "anywhere"])
 def test_derivatives_along_the_group(start, x64, rng):
     degree = 3

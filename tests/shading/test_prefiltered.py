@@ -95,7 +95,7 @@ def test_no_light_and_views_below(rng):
     assert np.all(np.isnan(shading.shade_prefiltered(lit, np.zeros_like(n), v)))
 
 
-def test_what_cannot_be_filtered_is_refused(rng):
+def test_what_cannot_be_filtered_is_refused(rng, as_user):
     lobes, e = lobes_of("glossy", np.dtype("float32")), light(rng).astype(np.float32)
     with pytest.raises(ValueError, match="tolerance"):
         shading.prefilter(lobes, e, tolerance=0.0)
