@@ -132,7 +132,7 @@ def test_a_plan_is_the_general_path_at_its_degrees(material, rng):
     assert np.array_equal(below, np.zeros((40, 3)))
 
 
-@pytest.mark.parametrize("light", ["room", "lamp"])
+@pytest.mark.parametrize("light", ["room", pytest.param("lamp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("material", MATERIALS)
 def test_the_tolerance_is_met_against_quadrature(material, light, rng):
     """Every pair by itself, at pixels that the plan has not seen."""

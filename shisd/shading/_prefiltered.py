@@ -163,9 +163,10 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
     turning = np.flatnonzero(m > 0)  # these have a V
     order, reduce, expand = (np.concatenate([x, y[turning]]) for x, y in ((m, -m), (reduce, reduce), (expand, expand)))
     pad = lambda x: np.pad(x, ((0, -len(x) % 8), *[(0, 0)] * (x.ndim - 1)))
+    table = lambda x: jnp.asarray(pad(x), float)
     highest, none = min(-(-int(m.max()) // 4) * 4, degree), jnp.zeros((0, 0))
     return PrefilteredLobes(
-        none, none, jnp.asarray(pad(order), jnp.int32), *(jnp.asarray(pad(x), float) for x in (reduce, expand)),
+        none, none, jnp.asarray(pad(order), jnp.int32), table(reduce), table(expand),
         jnp.asarray(mirror), jnp.asarray(len(m), jnp.int32), jnp.asarray(error, float), highest, ((), ()),
     )  # fmt: skip
 
