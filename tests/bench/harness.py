@@ -152,7 +152,7 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
     figure, axes = pyplot.subplots(
         rows_of_panels,
         columns,
-        figsize=(4.2 * columns, 3.1 * rows_of_panels + 0.7),
+        figsize=(4.6 * columns, 3.1 * rows_of_panels + 1.2),
         squeeze=False,
         layout="constrained",
     )
@@ -181,7 +181,7 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
     for axis in axes[:, 0]:
         axis.set_ylabel("relative RMSE")
     handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2 * columns - (columns > 1), fontsize=7)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
