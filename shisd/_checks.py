@@ -52,6 +52,14 @@ def coefficients(name: str, value: ArrayLike) -> tuple[Array, int]:
     return array, degree
 
 
+def expansion(name: str, value: ArrayLike) -> tuple[Array, int]:
+    """`value` as the floating coefficients [n] or [colour, n] of one function of direction, and the degree."""
+    c, degree = coefficients(name, value)
+    if c.ndim > 2:
+        raise ValueError(f"`{name}` must have shape [n] or [colour, n]; got {list(c.shape)}.")
+    return c, degree
+
+
 def degree_of(size: int) -> int:
     """The degree L of (L+1)^2 coefficients."""
     return math.isqrt(size) - 1

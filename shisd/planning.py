@@ -73,8 +73,7 @@ class Scene(eqx.Module):
                 if points is None:
                     raise ValueError(f"`lights`[{name!r}] is local; pass `points` [N, 3] that see it.")
             elif not isinstance(light, Environment):
-                if _checks.coefficients(f"lights[{name!r}]", light)[0].ndim > 2:
-                    raise ValueError(f"`lights`[{name!r}] must have shape [n] or [colour, n].")
+                _checks.expansion(f"lights[{name!r}]", light)
         self.materials, self.lights = dict(materials), dict(lights)
         self.points = None if points is None else _checks.vectors("points", points).reshape(-1, 3)
         if self.points is not None and len(self.points) == 0:
@@ -345,7 +344,8 @@ def plan(
     UserWarning says so; `throw=True` raises ValueError instead.
     Accuracy: predictions are for bands up to max(32, 2 max_degree); for most materials they are within a factor of 2 of
     what quadrature measures (tests/bench/planning.py). Materials and lights in float32 show nothing below 1e-5.
-    Not traced: it runs on the host and returns what is to be traced. Cost: some seconds per kind of material.
+    Not traced: it runs on the host and returns what is to be traced.
+    Cost: every material is tabulated once, which compiles for each kind of material.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"`scene` must be a planning.Scene; got {type(scene).__name__}.")

@@ -115,7 +115,8 @@ def test_the_axis_of_a_light_is_found(zonal):
         np.testing.assert_allclose(abs(light.axis @ np.asarray(axis)), 1, rtol=1e-6)
 
 
-@pytest.mark.parametrize("material", ["clay", pytest.param("satin", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("material", ["clay", "satin"])
 def test_a_plan_is_the_general_path_at_its_degrees(material, rng):
     where = pixels(rng, 40)
     entries = [e for e in planned().entries if e.material == material]

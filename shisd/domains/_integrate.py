@@ -8,6 +8,7 @@ large polygons, but takes longer, and small polygons lose digits in it.
 """
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -143,20 +144,49 @@ def loop_coefficients(v: Loop, solid_angle: Float[Array, " p"], degree: int) -> 
         return constant
     axes, inverse = zonal_inverse(degree, v.dtype)
     zonal = _moments.moments(jnp.asarray(axes), v, degree)  # l k p
-    bands = [jnp.asarray(inverse[l * l : (l + 1) ** 2]) @ zonal[l - 1] for l in range(1, degree + 1)]
+    bands = [jnp.asarray(inverse[l]) @ zonal[l - 1] for l in range(1, degree + 1)]
     return jnp.concatenate([constant, *bands])
 
 
+def fold_expansion(
+    c: Float[Array, "rows p"], v: Loop, axes: np.ndarray, inverse: list[np.ndarray], spare: int = 0
+) -> Float[Array, " p"]:
+    """Integrals of expansions, each over its loop, without their constants, with the rows and axes of an inverse.
+
+    They are weights (inverse_l)^T c_l on moments. The last `spare` edges seldom have a length.
+    """
+    weights, used = [], 0
+    for l, matrix in enumerate(inverse):
+        weights.append(jnp.asarray(matrix.T / max(l * (l + 1), 1)) @ c[used : used + len(matrix)])
+        used += len(matrix)
+    return _moments.fold(jnp.stack(weights), jnp.asarray(axes), v, len(inverse) - 1, spare)
+
+
 @functools.cache
-def zonal_inverse(degree: int, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
-    """Axes [K, 3], and the matrix [(L+1)^2, K] from I_l(z_k) to the integrals of y_l^m."""
+def zonal_inverse(degree: int, dtype: DTypeLike) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Axes [K, 3], and for every l the matrix [2l+1, K] from I_l(z_k) to the integrals of y_l^m."""
     with jax.ensure_compile_time_eval():
         if degree <= TABLE_DEGREE:
             axes = np.asarray(optimized_directions(degree, dtype=dtype))
         else:
             axes = np.asarray(fibonacci_directions(2 * (2 * degree + 1), dtype=dtype))
+    return axes, _inverses(axes, degree, lambda l: slice(l * l, (l + 1) ** 2))
+
+
+@functools.cache
+def incidence_inverse(degree: int, dtype: DTypeLike) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The same for integrands that are even in y: axes [L+1, 3] in the plane y = 0, matrices [l+1, L+1] for m >= 0.
+
+    About the y axis such a function has orders m = -l, -l+2, ... l only, and its zonal functions about axes in the
+    plane are their Fourier series. At L+1 equal steps over half a turn these are orthogonal: the condition number of a
+    band is the ratio of the largest to the least |y_l^m| on the equator, about (pi l)^(1/4).
+    """
+    angle = np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
+    axes = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1).astype(dtype)
+    return axes, _inverses(axes, degree, lambda l: slice(l * l + l, (l + 1) ** 2))
+
+
+def _inverses(axes: np.ndarray, degree: int, rows: Callable[[int], slice]) -> list[np.ndarray]:
     z = axes.astype(float)
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
-    y = _tables.basis(z, degree)
-    bands = [np.linalg.pinv(4 * np.pi / (2 * l + 1) * y[:, l * l : (l + 1) ** 2]) for l in range(degree + 1)]
-    return axes, np.concatenate(bands).astype(dtype)
+    y = _tables.basis(z / np.linalg.norm(z, axis=1, keepdims=True), degree)
+    return [np.linalg.pinv(4 * np.pi / (2 * l + 1) * y[:, rows(l)]).astype(axes.dtype) for l in range(degree + 1)]

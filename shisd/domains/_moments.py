@@ -48,37 +48,53 @@ Value = TypeVar("Value")
 _OPERATIONS = 1600  # in one kernel: XLA cuts longer ones up, which makes them scalar code
 
 
-def fold(weights: Float[Array, "k l q"], axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, " p"]:
-    """sum over k and l >= 1 of weights[k, l] l (l+1) I_l(axes[k]) for every polygon. Weights may be shared (q = 1)."""
+def fold(
+    weights: Float[Array, "l k q"], axes: Float[Array, "k 3"], v: Loop, degree: int, spare: int = 0
+) -> Float[Array, " p"]:
+    """sum over k and l >= 1 of weights[l, k] l (l+1) I_l(axes[k]) for every polygon. Weights may be shared (q = 1).
+
+    The last `spare` edges cost time only if one of them has a length, in any polygon.
+    """
     if degree == 0:
         return jnp.zeros(v.shape[2:], v.dtype)
     if _edges_at_once(degree) > 0:
-        return _fold(weights, axes, v, degree)
+        return _fold(weights, axes, v, degree, spare)
     return _sum_all(moments(axes, v, degree) * _by_degree(weights))
 
 
-def _by_degree(weights: Float[Array, "k l q"]) -> Array:
-    """Weights [l, k, q] of I_l, from l = 1 on."""
-    l = np.arange(1, weights.shape[1])
-    return jnp.swapaxes(weights, 0, 1)[1:] * jnp.asarray(l * (l + 1), weights.dtype)[:, None, None]
+def _by_degree(weights: Float[Array, "l k q"]) -> Array:
+    """Weights of I_l, from l = 1 on."""
+    l = np.arange(1, weights.shape[0])
+    return weights[1:] * jnp.asarray(l * (l + 1), weights.dtype)[:, None, None]
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _fold(weights: Array, axes: Array, v: Loop, degree: int) -> Float[Array, " p"]:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def _fold(weights: Array, axes: Array, v: Loop, degree: int, spare: int) -> Float[Array, " p"]:
+    arcs = _arcs(v)
+    edges, more = jnp.split(arcs.edges, [v.shape[1] - spare], axis=1)
+    value = _fold_edges(weights, axes, arcs.c, arcs.total, edges, degree)
+    if spare == 0:
+        return value
+    used = jnp.any(_unpack(_Edges, more).over_angle != 0)
+    rest = lambda: value + _fold_edges(weights, axes, arcs.c, jnp.zeros_like(arcs.total), more, degree)
+    return jax.lax.cond(used, rest, lambda: value)
+
+
+@functools.partial(jax.jit, static_argnames="degree")  # so that it is traced once
+def _fold_edges(weights: Array, axes: Array, center: Array, total: Array, edges: Array, degree: int) -> Array:
     """Axes in turn; for each, edges and degrees are straight code over plain vectors of points.
 
     That becomes one kernel in vector registers. Arrays over axes and points, or more than a few operands, would make it
     scalar code, since LLVM could not tell that they do not overlap.
     """
-    groups = math.ceil(v.shape[1] / _edges_at_once(degree))
-    spare = jnp.broadcast_to(v[:, -1:], (3, -v.shape[1] % groups, v.shape[2]))  # edges of no length fill up the last
-    arcs = _arcs(jnp.concatenate([v, spare], axis=1))
-    share = arcs.total / groups
-    factors = _factors(2, degree, v.dtype)
+    groups = math.ceil(edges.shape[1] / _edges_at_once(degree))
+    none = jnp.zeros((edges.shape[0], -edges.shape[1] % groups, edges.shape[2]), edges.dtype)
+    edges = jnp.concatenate([edges, none], axis=1)  # edges of no length fill up the last group
+    share, factors = total / groups, _factors(2, degree, edges.dtype)
 
     def group(value: Array, edges: Float[Array, "rows e p"]) -> tuple[Array, None]:
         def axis(value: Array, d: Array, w: Array) -> Array:
-            c = _reference(arcs.c, d)
+            c = _reference(center, d)
             terms = _zonal_terms([_unpack(_Edges, edges[:, e]) for e in range(edges.shape[1])], d, c)
             point, states = c.start(), [t.start() for t in terms]
             sums, sum_c = [jnp.zeros_like(c.gap) for _ in terms], w[1]
@@ -93,10 +109,10 @@ def _fold(weights: Array, axes: Array, v: Loop, degree: int) -> Float[Array, " p
 
         return _for_axes(axis, value, axes, weights), None
 
-    value = jnp.zeros_like(arcs.total[0])
+    value = jnp.zeros_like(total[0])
     if groups == 1:
-        return group(value, arcs.edges)[0]
-    parts = arcs.edges.reshape(arcs.edges.shape[0], groups, -1, v.shape[2])
+        return group(value, edges)[0]
+    parts = edges.reshape(edges.shape[0], groups, -1, edges.shape[2])
     return jax.lax.scan(group, value, jnp.moveaxis(parts, 1, 0))[0]
 
 
@@ -104,9 +120,9 @@ def _edges_at_once(degree: int) -> int:
     return (_OPERATIONS // degree - 7) // 18  # a step takes 18 operations for each edge, and 7 for all
 
 
-def _fold_jvp(degree, primals, tangents):
+def _fold_jvp(degree, spare, primals, tangents):
     (weights, axes, v), (d_weights, d_axes, dv) = primals, tangents
-    value = _fold(weights, axes, v, degree)
+    value = _fold(weights, axes, v, degree, spare)
     change = jnp.zeros_like(value)
     if not isinstance(d_weights, SymbolicZero):
         change += _sum_all(moments(axes, v, degree) * _by_degree(d_weights))
@@ -124,25 +140,33 @@ def _fold_jvp(degree, primals, tangents):
 _fold.defjvp(_fold_jvp, symbolic_zeros=True)
 
 
+@functools.partial(jax.jit, static_argnames="degree")
 def _fold_boundary(weights: Array, axes: Array, spans: Float[Array, "rows e p"], degree: int) -> tuple[Array, Array]:
-    """sum over k and l of weights[k, l] l (l+1) times the integrals of `_at_vertices`, [e, p] each."""
+    """sum over k and l of weights[l, k] l (l+1) times the integrals of `_at_vertices`, [e, p] each.
+
+    Both sums are the parts of one complex number: of two results XLA would make two kernels, each with all the work.
+    """
     factors = _factors(1, degree, spans.dtype)
     zero = jnp.zeros_like(spans[0, 0])
 
-    def edge(_: None, span: Float[Array, "rows p"]) -> tuple[None, tuple[Array, Array]]:
-        def axis(total: tuple[Array, Array], d: Array, w: Array) -> tuple[Array, Array]:
+    def edge(span: Float[Array, "rows p"]) -> Array:
+        def axis(total: Array, d: Array, w: Array) -> Array:
             terms = _boundary(_unpack(_Spans, span), d)
             state, middle, chord = terms.start(), zero, zero
             for l in range(1, degree + 1):
                 state = terms.advance(state, _Factors(*(f[l - 1] for f in factors)))
                 w_l = l * (l + 1.0) * w[l]
                 middle, chord = middle + w_l * state.middle, chord + w_l * state.chord
-            return total[0] + middle, total[1] + chord
+            return total + jax.lax.complex(middle, chord)
 
-        return None, _for_axes(axis, (zero, zero), axes, weights)
+        return _for_axes(axis, jax.lax.complex(zero, zero), axes, weights)
 
-    _, (middle, chord) = jax.lax.scan(edge, None, jnp.moveaxis(spans, 1, 0))
-    return _at_vertices(_unpack(_Spans, spans), middle, chord)
+    def edge_if_any(span: Float[Array, "rows p"]) -> Array:
+        nothing = lambda _: jax.lax.complex(zero, zero)
+        return jax.lax.cond(jnp.any(_unpack(_Spans, span).over_angle != 0), edge, nothing, span)
+
+    sums = jax.lax.map(edge_if_any, jnp.moveaxis(spans, 1, 0))
+    return _at_vertices(_unpack(_Spans, spans), sums.real, sums.imag)
 
 
 def _for_axes(body: Callable, value: Value, axes: Array, weights: Array) -> Value:
@@ -151,7 +175,7 @@ def _for_axes(body: Callable, value: Value, axes: Array, weights: Array) -> Valu
     Axis and weights are fetched a step ahead: the body then reads arrays, not rows at an address that it has to find,
     which would keep LLVM from vector code.
     """
-    fetch = lambda k: (axes[k], weights[k])
+    fetch = lambda k: (axes[k], weights[:, k])
 
     def step(state: tuple, following: Array) -> tuple[tuple, None]:
         value, (d, w) = state

@@ -160,12 +160,13 @@ def clip(points: Loop, height: Float[Array, "s p"]) -> Float[Array, "3 t p"]:
     crosses = inside != inside_next
     part = height / jnp.where(crosses, height - height_next, 1)
     crossing = points + jnp.where(crosses, part, 0)[None] * (jnp.roll(points, -1, 1) - points)
-    found = jnp.stack([inside, crosses], axis=1).reshape(2 * slots, -1)  # in order along the outline
-    candidates = jnp.stack([points, crossing], axis=2).reshape(3, 2 * slots, -1)
-    place = jnp.cumsum(found, axis=0, dtype=jnp.int32) - 1
-    nothing = place[-1] < 0
     slot = jnp.arange(slots + slots // 2, dtype=jnp.int32)[:, None]
-    slot = jnp.where(slot > place[-1][None], 0, slot)  # slots beyond the last repeat the first
-    chosen = (place[None] == slot[:, None]) & found[None]  # [t, 2s, p]
-    result = jnp.sum(jnp.where(chosen[None], candidates[:, None], 0), axis=2)
-    return jnp.where(nothing[None, None], jax.lax.stop_gradient(points[:, :1]), result)
+    # with nothing inside, coincident vertices; otherwise slots beyond the last keep the first that is found
+    result = jnp.broadcast_to(jax.lax.stop_gradient(points[:, :1]), (3, slot.shape[0], points.shape[2]))
+    count = jnp.zeros(height.shape[1:], jnp.int32)
+    for i in range(slots):
+        for found, x in ((inside[i], points[:, i]), (crosses[i], crossing[:, i])):
+            here = found[None] & ((slot == count[None]) | (count == 0)[None])
+            result = jnp.where(here[None], x[:, None], result)
+            count += found.astype(jnp.int32)
+    return result

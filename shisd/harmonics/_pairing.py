@@ -11,6 +11,7 @@ notation: k = |m|; A = orders with l + k even, B = odd; x = coefficients of m >=
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -20,10 +21,9 @@ from jax.custom_derivatives import SymbolicZero
 
 from shisd._typing import Array, Float
 from shisd.harmonics import _tables
-from shisd.harmonics._rotation import turns
+from shisd.harmonics._rotation import QUARTER, rates, turns
 
 _DEGREES_TOGETHER = 4  # more make fewer and larger products, with more zeros in them
-_QUARTER = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # turn about x
 
 Parts = tuple[Array, ...]  # xa, ya, xb, yb
 Waves = list[Array]  # cosines and sines [L+1, p] of the multiples of an angle
@@ -44,6 +44,7 @@ class _Block(NamedTuple):
 @functools.cache
 def _blocks(degree: int) -> tuple[_Block, ...]:
     none = (degree + 1) ** 2
+    exchange, about_x, about_y = _tables.swap_matrices(degree), *_generators(degree)
     blocks = []
     for parity in range(min(2, degree + 1)):
         of_parity = np.arange(parity, degree + 1, 2)
@@ -54,9 +55,6 @@ def _blocks(degree: int) -> tuple[_Block, ...]:
             xa, xb = (np.where(k <= l, l * l + l + k, none) for k in (a, b))
             ya, yb = (np.where((k <= l) & (k > 0), l * l + l - k, none) for k in (a, b))
             part = functools.partial(_part, degrees, none)
-            exchange, about_x, about_y = (
-                [matrices[d] for d in degrees] for matrices in (_tables.swap_matrices(degree), *_rates(degree))
-            )
             blocks.append(_Block(
                 a, b, np.concatenate([xa.ravel(), xb.ravel()]), np.concatenate([ya.ravel(), yb.ravel()]),
                 (part(exchange, xa, xa), part(exchange, ya, xb), part(exchange, xb, ya), part(exchange, yb, yb)),
@@ -66,16 +64,17 @@ def _blocks(degree: int) -> tuple[_Block, ...]:
     return tuple(blocks)
 
 
-def _part(degrees: np.ndarray, none: int, matrices: list[np.ndarray], to: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Rows `to` and columns `source` of one matrix for each degree; zero where there is no coefficient."""
+def _part(
+    degrees: np.ndarray, none: int, matrices: Sequence[np.ndarray], to: np.ndarray, source: np.ndarray
+) -> np.ndarray:
+    """Rows `to` and columns `source` of the matrix of each of some degrees; zero where there is no coefficient."""
     cut = lambda l, index: np.where(index < none, index - l * l, 2 * l + 1)
     return np.stack([
-        np.pad(j, (0, 1))[np.ix_(cut(l, t), cut(l, s))]
-        for l, j, t, s in zip(degrees, matrices, to, source, strict=True)
+        np.pad(matrices[l], (0, 1))[np.ix_(cut(l, t), cut(l, s))] for l, t, s in zip(degrees, to, source, strict=True)
     ])  # fmt: skip
 
 
-def _rates(degree: int) -> list[list[np.ndarray]]:
+def _generators(degree: int) -> list[list[np.ndarray]]:
     """For x and y, the generator of every band as a matrix."""
     matrices = []
     for terms in _tables.generator_gather(degree)[:2]:
@@ -98,57 +97,53 @@ def rows(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
 def pair_many(
-    x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], c: Float[Array, "f2 n"], r: Float[Array, "p 3 3"],
+    x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], series: Float[Array, "n f2 k"], r: Float[Array, "p 3 3"],
     degree: int, upright: bool = False,
 ) -> Float[Array, "f3 p"]:  # fmt: skip
-    """sum over n of s_n (R c)_n, for an s of every rotation, ordered as `rows` says, and a c that all share.
+    """sum over n of s_n (R c)_n, for an s of every rotation, ordered as `rows` says, and `swapped_series` of a c.
 
     Of the numbers of colours f and f2 one may be 1. `upright` promises that R z has y = 0 <= x.
     Derivatives: exact wherever the pole stays in place, to every order.
     """
     a, b, g = turns(r, max(degree, 1))
-    return _pair(_split(x, y, degree), c, None if upright else a, b, g, degree)
+    return _pair(_split(x, y, degree), series, None if upright else a, b, g, degree)
 
 
 def _pair_many_jvp(degree, upright, primals, tangents):
-    (x, y, c, r), (dx, dy, dc, dr) = primals, tangents
-    value = pair_many(x, y, c, r, degree, upright)
-    change = jnp.zeros_like(value)
+    (x, y, series, r), (dx, dy, d_series, dr) = primals, tangents
+    value = pair_many(x, y, series, r, degree, upright)
+    change, lobe = jnp.zeros_like(value), _split(x, y, degree)
     zero = lambda t, like: jnp.zeros_like(like) if isinstance(t, SymbolicZero) else t
     if not all(isinstance(t, SymbolicZero) for t in (dx, dy, dr)):
-        lobe = _split(zero(dx, x), zero(dy, y), degree)
-        if not isinstance(
-            dr, SymbolicZero
-        ):  # d(s . R c) = s . G R c = (-G s) . R c with the rate G, as in `rotate_many`
-            rate = jnp.einsum("pij,pkj->pik", dr, r)
-            rates = (rate[:, 1, 2] - rate[:, 2, 1], rate[:, 2, 0] - rate[:, 0, 2], rate[:, 0, 1] - rate[:, 1, 0])
-            turning = _turning(_split(x, y, degree), [w / 2 for w in rates], degree)
-            lobe = [tuple(p + q for p, q in zip(s, t, strict=True)) for s, t in zip(lobe, turning, strict=True)]
-        change += _pair_away_from_pole(lobe, c, r, degree)
-    if not isinstance(dc, SymbolicZero):
-        change += _pair_away_from_pole(_split(x, y, degree), dc, r, degree)
+        moved = _split(zero(dx, x), zero(dy, y), degree)
+        if not isinstance(dr, SymbolicZero):  # s . G R c = (-G s) . R c with the generator G, as in `rotate_many`
+            turning = _turning(lobe, [-w for w in rates(r, dr)], degree)
+            moved = [tuple(p + q for p, q in zip(s, t, strict=True)) for s, t in zip(moved, turning, strict=True)]
+        change += _pair_away_from_pole(moved, series, r, degree)
+    if not isinstance(d_series, SymbolicZero):
+        change += _pair_away_from_pole(lobe, d_series, r, degree)
     return value, change
 
 
 pair_many.defjvp(_pair_many_jvp, symbolic_zeros=True)
 
 
-def _pair_away_from_pole(s: list[Parts], c: Array, r: Float[Array, "p 3 3"], degree: int) -> Array:
+def _pair_away_from_pole(s: list[Parts], series: Array, r: Float[Array, "p 3 3"], degree: int) -> Array:
     """`pair_many` with smooth angles: where R nearly keeps the z axis, s . R c = Q s . Q R c with Q, a quarter turn."""
     near = r[:, 2, 2] ** 2 > 0.5
-    a, b, g = turns(jnp.where(near[:, None, None], jnp.asarray(_QUARTER, r.dtype) @ r, r), max(degree, 1))
+    a, b, g = turns(jnp.where(near[:, None, None], jnp.asarray(QUARTER, r.dtype) @ r, r), max(degree, 1))
     here = near[None, None, None]
     turned = [(xa, -ya, xb, -yb) for xa, ya, xb, yb in _swapped(s, degree)]
     s = [tuple(jnp.where(here, q, p) for p, q in zip(*both, strict=True)) for both in zip(s, turned, strict=True)]
-    return _pair(s, c, a, b, g, degree)
+    return _pair(s, series, a, b, g, degree)
 
 
-def _pair(s: list[Parts], c: Array, a: Waves | None, b: Waves, g: Waves, degree: int) -> Float[Array, "f3 p"]:
+def _pair(s: list[Parts], series: Array, a: Waves | None, b: Waves, g: Waves, degree: int) -> Float[Array, "f3 p"]:
     """(Z(b) J Z(-a) s) . (J Z(g) c)."""
     if a is not None:
         s = _turned(s, a[0], -a[1], degree)
     s = _turned(_swapped(s, degree), b[0], b[1], degree)
-    series = jnp.pad(_series(c, degree), ((0, 1), (0, 0), (0, 0)))
+    series = jnp.pad(series, ((0, 1), (0, 0), (0, 0)))
     colours = range(s[0][0].shape[2])
     totals = []
     for k in range(min(2, degree + 1)):  # even multiples of g meet x of even and y of odd degrees; and conversely
@@ -160,26 +155,13 @@ def _pair(s: list[Parts], c: Array, a: Waves | None, b: Waves, g: Waves, degree:
         factors = series[np.concatenate(index)]
         factors = jnp.concatenate([factors[..., k : degree + 1 : 2], factors[..., degree + 1 + k :: 2]], axis=-1)
         waves = jnp.concatenate([g[0][k::2], g[1][k::2]])
-        rows = [jnp.concatenate([z[:, :, i].reshape(-1, z.shape[-1]) for z in kept]) for i in colours]
-        if len(rows) == 1:
-            sums = jnp.einsum("nfk,np->fkp", factors, rows[0])
+        lobe = [jnp.concatenate([z[:, :, i].reshape(-1, z.shape[-1]) for z in kept]) for i in colours]
+        if len(lobe) == 1:
+            sums = jnp.einsum("nfk,np->fkp", factors, lobe[0])
         else:
-            sums = jnp.stack([factors[:, min(i, factors.shape[1] - 1)].T @ rows[i] for i in colours])
+            sums = jnp.stack([factors[:, min(i, factors.shape[1] - 1)].T @ lobe[i] for i in colours])
         totals.append(jnp.sum(sums * waves[None], axis=1))
     return functools.reduce(jnp.add, totals)
-
-
-def _series(c: Float[Array, "f n"], degree: int) -> Float[Array, "n f k"]:
-    """J Z(g) c as factors of cos(k g), then of sin(k g)."""
-    cosine, sine = [], []
-    for l, j in enumerate(_tables.swap_matrices(degree)):
-        plus, minus = c[None, :, l * l + l : (l + 1) ** 2], c[None, :, l * l : l * l + l + 1][..., ::-1]
-        j_plus = jnp.asarray(j[:, None, l:], c.dtype)
-        j_minus = jnp.asarray(j[:, None, l::-1] * (np.arange(l + 1) > 0), c.dtype)  # m = 0 counts once
-        pad = ((0, 0), (0, 0), (0, degree - l))
-        cosine.append(jnp.pad(j_plus * plus + j_minus * minus, pad))
-        sine.append(jnp.pad(j_minus * plus - j_plus * minus, pad))
-    return jnp.concatenate([jnp.concatenate(cosine), jnp.concatenate(sine)], axis=-1)
 
 
 # ---- block by block
@@ -202,11 +184,11 @@ def _swapped(s: list[Parts], degree: int) -> list[Parts]:
     return [_product(block.swap, (xa, xb, ya, yb)) for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True)]
 
 
-def _turning(s: list[Parts], rates: list[Array], degree: int) -> list[Parts]:
-    """G s of rotation with `rates` [p] about x, y and z."""
+def _turning(s: list[Parts], about: list[Array], degree: int) -> list[Parts]:
+    """G s of rotation at these rates [p] about x, y and z."""
     changes = []
     for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True):
-        wx, wy, wz = (w[None, None, None] for w in rates)
+        wx, wy, wz = (w[None, None, None] for w in about)
         a, b = (jnp.asarray(k[None, :, None, None], xa.dtype) for k in (block.a, block.b))
         about_x, about_y = _product(block.about_x, (yb, xb, ya, xa)), _product(block.about_y, (xb, yb, xa, ya))
         about_z = (-a * ya, a * xa, -b * yb, b * xb)

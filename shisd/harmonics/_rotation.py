@@ -52,6 +52,9 @@ def _rotate(c: Float[Array, "*batch n"], r: Float[Array, "3 3"], degree: int) ->
     return rotate_many(flat, r[None], degree)[..., 0].T.reshape(c.shape)
 
 
+QUARTER = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # turn about x
+
+
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def rotate_many(
     c: Float[Array, "f n"] | Float[Array, "n f p"], r: Float[Array, "p 3 3"], degree: int, upright: bool = False
@@ -71,15 +74,19 @@ def _rotate_many_jvp(degree, upright, primals, tangents):
     if not isinstance(dc, SymbolicZero):
         dx += _rotate_many_away_from_pole(dc, r, degree)
     if not isinstance(dr, SymbolicZero):
-        rate = jnp.einsum("pij,pkj->pik", dr, r)  # dR R^T, whose skew part is the rate of rotation in the target frame
-        rates = (rate[:, 2, 1] - rate[:, 1, 2], rate[:, 0, 2] - rate[:, 2, 0], rate[:, 1, 0] - rate[:, 0, 1])
-        for w, terms in zip(rates, _tables.generator_gather(degree), strict=True):
+        for w, terms in zip(rates(r, dr), _tables.generator_gather(degree), strict=True):
             for index, factor in terms:
-                dx += jnp.asarray(factor[:, None, None], x.dtype) * (w / 2)[None, None] * x[index]
+                dx += jnp.asarray(factor[:, None, None], x.dtype) * w[None, None] * x[index]
     return x, dx
 
 
 rotate_many.defjvp(_rotate_many_jvp, symbolic_zeros=True)
+
+
+def rates(r: Float[Array, "p 3 3"], dr: Float[Array, "p 3 3"]) -> list[Array]:
+    """Rates of rotation [p] about x, y and z of the target frame: the skew part of dR R^T."""
+    rate = jnp.einsum("pij,pkj->pik", dr, r)
+    return [(rate[:, j, i] - rate[:, i, j]) / 2 for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def _rotate_many_away_from_pole(c: Array, r: Float[Array, "p 3 3"], degree: int) -> Array:
@@ -87,7 +94,7 @@ def _rotate_many_away_from_pole(c: Array, r: Float[Array, "p 3 3"], degree: int)
 
     Where R nearly keeps the z axis, R = (R Q^T) Q with the quarter turn Q about x; R Q^T takes z far from z.
     """
-    quarter = jnp.asarray([[1, 0, 0], [0, 0, -1], [0, 1, 0]], r.dtype)
+    quarter = jnp.asarray(QUARTER, r.dtype)
     near = r[:, 2, 2] ** 2 > 0.5
     a, b, (cos_g, sin_g) = turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
     flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[:, None, None], c.dtype)
@@ -141,6 +148,11 @@ def _swap_turned(c: Array, cos: Array, sin: Array, degree: int) -> Float[Array, 
     """`swap` of `_turn`; of coefficients [f, n] that all rotations share, one product with the cosines and sines."""
     if c.ndim == 3:
         return swap(_turn(c, cos, sin, degree), degree)
+    return jnp.tensordot(swapped_series(c, degree), jnp.concatenate([cos, sin]), 1)
+
+
+def swapped_series(c: Float[Array, "f n"], degree: int) -> Float[Array, "n f k"]:
+    """J Z(g) c as factors of cos(k g), k = 0 ... L, then of sin(k g)."""
     cosine, sine = [], []
     for l, j in enumerate(_tables.swap_matrices(degree)):
         plus, minus = c[None, :, l * l + l : (l + 1) ** 2], c[None, :, l * l : l * l + l + 1][..., ::-1]
@@ -149,5 +161,4 @@ def _swap_turned(c: Array, cos: Array, sin: Array, degree: int) -> Float[Array, 
         pad = ((0, 0), (0, 0), (0, degree - l))
         cosine.append(jnp.pad(j_plus * plus + j_minus * minus, pad))
         sine.append(jnp.pad(j_minus * plus - j_plus * minus, pad))
-    series = jnp.concatenate([jnp.concatenate(cosine), jnp.concatenate(sine)], axis=-1)  # [n, f, 2 (L+1)]
-    return jnp.tensordot(series, jnp.concatenate([cos, sin]), 1)
+    return jnp.concatenate([jnp.concatenate(cosine), jnp.concatenate(sine)], axis=-1)

@@ -37,7 +37,7 @@ class PolygonLight(eqx.Module):
         p, e = _checks.outline("points", points), _checks.real_array("emission", emission)
         if e.ndim > 1:
             raise ValueError(f"`emission` must be a scalar or [colour]; got shape {list(e.shape)}.")
-        f = None if profile is None else _expansion("profile", profile)
+        f = None if profile is None else _checks.expansion("profile", profile)[0]
         if f is not None and f.ndim == 2 and e.ndim == 1 and 1 not in (len(f), len(e)) and len(f) != len(e):
             raise ValueError(f"colours of `emission` {list(e.shape)} and `profile` {list(f.shape)} do not broadcast.")
         dtype = jnp.result_type(p, e, *(() if f is None else (f,)))
@@ -66,7 +66,7 @@ class PortalLight(eqx.Module):
     two_sided: ClassVar[bool] = False
 
     def __init__(self, points: ArrayLike, coefficients: ArrayLike, degree: int):
-        p, c = _checks.outline("points", points), _expansion("coefficients", coefficients)
+        p, (c, _) = _checks.outline("points", points), _checks.expansion("coefficients", coefficients)
         self.degree = _checks.degree(degree)
         dtype = jnp.promote_types(p.dtype, c.dtype)
         self.points, self.coefficients = p.astype(dtype), c.astype(dtype)
@@ -82,10 +82,3 @@ def lobe_product(light: Float[Array, "*colour_n"], degree: int) -> Float[Array, 
     light_degree = _checks.degree_of(light.shape[-1])
     rows = [product_matrix(c, light_degree + degree, input_degree=degree) for c in light.reshape(-1, light.shape[-1])]
     return jnp.stack(rows).reshape(*light.shape[:-1], *rows[0].shape)
-
-
-def _expansion(name: str, value: ArrayLike) -> Float[Array, "*colour_n"]:
-    c, _ = _checks.coefficients(name, value)
-    if c.ndim > 2:
-        raise ValueError(f"`{name}` must have shape [n] or [colour, n]; got {list(c.shape)}.")
-    return c

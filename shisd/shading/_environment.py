@@ -17,7 +17,8 @@ from shisd import _checks
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics._pairing import pair_many
-from shisd.shading._lobes import Lobes, slice_orders
+from shisd.harmonics._rotation import swapped_series
+from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import shade_points, shade_tiles, surface
 
 _NUMBERS_AT_ONCE = 1 << 18  # coefficients of slices held at a time: what one tile of pixels needs stays in cache
@@ -45,13 +46,8 @@ def shade_environment(
     result; the same with gradients.
     Source: ISD15 Eq. 20-22.
     """
-    if not isinstance(lobes, Lobes):
-        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
-    if lobes.domain != "sphere":
-        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
-    e, light_degree = _checks.coefficients("light_coefficients", light_coefficients)
-    if e.ndim > 2:
-        raise ValueError(f"`light_coefficients` must have shape [n] or [colour, n]; got {list(e.shape)}.")
+    check_lobes(lobes, everywhere=True)
+    e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
     light = [("light_coefficients", e.shape[:-1])]
     lobes, points, colour = surface(lobes, tangents, light, [e.dtype], normals=normals, views=views)
     degree = min(light_degree, lobes.degree)
@@ -64,12 +60,11 @@ def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, e: Float[Array, "*c n"], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     degree = _checks.degree_of(e.shape[-1])
-    look_up = slice_orders(lobes, degree)
+    look_up, series = slice_orders(lobes, degree), swapped_series(e.reshape(-1, e.shape[-1]), degree)
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
         to_local = jnp.swapaxes(frame, 1, 2)
-        values = pair_many(*look_up(local), e.reshape(-1, e.shape[-1]), to_local, degree, lobes.isotropic)
-        return values.reshape(*colour, -1)
+        return pair_many(*look_up(local), series, to_local, degree, lobes.isotropic).reshape(*colour, -1)
 
     numbers = (degree + 1) ** 2 * int(np.prod(lobes.colour))
     size = min(2048, 1 << max(1, _NUMBERS_AT_ONCE // numbers).bit_length() - 1)

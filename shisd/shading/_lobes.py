@@ -70,6 +70,14 @@ class Lobes(eqx.Module):
         return self.basis.weights(self.slice_coefficients(view))
 
 
+def check_lobes(lobes: object, *, everywhere: bool) -> None:
+    """Lobes that stand for the material `everywhere`, or above the horizon at least."""
+    if not isinstance(lobes, Lobes):
+        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
+    if everywhere and lobes.domain != "sphere":
+        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
+
+
 def lookup_table(lobes: Lobes, degree: int | None = None) -> Float[Array, "*colour n columns"]:
     """What `slice_values` looks up, up to `degree`: splines in elevation times Fourier series in azimuth.
 
@@ -128,8 +136,8 @@ def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], t
 def _lookup_factors(view: Float[Array, "p 3"], lobes: Lobes) -> Float[Array, "columns p"]:
     """What the columns of `lookup_table` are multiplied by."""
     if lobes.isotropic:
-        return _views.spline_weights(view, lobes.weights.shape[-3])
-    spline = _views.spline_weights(view, lobes.weights.shape[-4])
+        return _views.spline_weights(_views.elevation(view), lobes.weights.shape[-3])
+    spline = _views.spline_weights(_views.elevation(view), lobes.weights.shape[-4])
     waves = jnp.stack(_views.azimuth_factors(view, lobes.weights.shape[-3] // 2 + 1))  # [2, k, p]
     return (waves[:, :, None] * spline[None, None]).reshape(-1, view.shape[0])
 

@@ -19,19 +19,21 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import times
+from shisd._numerics import dot, times
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
-from shisd.domains import HaarBasis, _moments
+from shisd.domains import HaarBasis
 from shisd.domains._haar import clip_to_cells
-from shisd.domains._integrate import loop_coefficients, zonal_inverse
+from shisd.domains._integrate import fold_expansion, loop_coefficients, zonal_inverse
 from shisd.domains._moments import Loop
 from shisd.domains._polygon import clip, loop_solid_angle, on_sphere
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models._light import lobe_product
-from shisd.shading._lobes import Lobes, lookup_table, slice_values
+from shisd.shading import _views
+from shisd.shading._incidence import incidence_integrals
+from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
 from shisd.shading._surface import in_tiles, shade_points, shade_tiles, surface
 
 Light = PolygonLight | PortalLight
@@ -118,8 +120,7 @@ def _shade_lights(
     views: ArrayLike,
     tangents: ArrayLike | None,
 ) -> Float[Array, "*batch_colour"]:
-    if not isinstance(lobes, Lobes):
-        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
+    check_lobes(lobes, everywhere=False)
     lights = tuple(light) if isinstance(light, Sequence) else (light,)
     if not lights or not all(isinstance(x, kind) for x in lights):
         raise ValueError(f"`{name}` must be a models.{kind.__name__} or a sequence of at least one.")
@@ -139,32 +140,63 @@ def _shade_lights(
 def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[Light, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    degree, table = lobes.degree, lookup_table(lobes)
-    axes = jnp.asarray(zonal_inverse(degree, table.dtype)[0])
-    products = [_product(light, degree) for light in lights]
+    table = lookup_table(lobes)
+    products = [_product(light, lobes.degree) for light in lights]
 
     def radiance(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
     ) -> Float[Array, "*colour p"]:
-        slices = slice_values(table, local, lobes)
         total = jnp.zeros((*colour, positions.shape[0]), table.dtype)
         for light, product in zip(lights, products, strict=True):
-            v, sign = _outline(light, positions, frame)
-            angle = loop_solid_angle(v, 2 * np.pi, _up(v))
+            relative = light.points.T[:, :, None] - positions.T[:, None]
+            above = dot(frame[:, :, 2].T[:, None], relative)
+            sign = jnp.where(jnp.max(above, axis=0) > 0, _facing(light, relative), 0)
+            outline = _local(frame, relative)
             if product is None:
-                lit = jnp.stack([_constant(s, v, angle, axes, degree) for s in slices.reshape(-1, *slices.shape[-2:])])
-                lit = times(lit.reshape(*lobes.colour, -1), _constant_radiance(light))
+                lit = times(_uniform(lobes, table, local, outline, above, sign), _constant_radiance(light))
             else:
-                world = jnp.einsum("pij,jsp->isp", frame, v)
-                seen = _through(product, world, angle).reshape(-1, slices.shape[-2], v.shape[2])
-                seen = rotate_many(jnp.moveaxis(seen, 0, 1), jnp.swapaxes(frame, 1, 2), degree, lobes.isotropic)
-                seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *slices.shape[-2:])
-                lit = jnp.sum(times(slices, seen), axis=-2)
+                lit = _directional(lobes, table, frame, local, outline, product)
             total += jnp.broadcast_to(times(lit, sign), total.shape)
         return total
 
     size = _TILE if all(product is None for product in products) else _SMALL_TILE
     return shade_tiles(lobes, points, colour, size, radiance)
+
+
+def _uniform(lobes: Lobes, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:
+    """Integrals of slices over the outline above the horizon, [*colour, p]."""
+    dark = sign == 0
+    spare = outline.shape[1] // 2  # edges, unless the horizon cuts an outline of this tile
+
+    def integrals() -> Float[Array, "*colour p"]:
+        whole = lambda: jnp.concatenate([outline, *[outline[:, :1]] * spare], axis=1)
+        all_whole = jnp.all((jnp.min(above, axis=0) > 0) | dark)
+        v = on_sphere(jax.lax.cond(all_whole, whole, lambda: clip(outline, above)))
+        angle = loop_solid_angle(v, 2 * np.pi, _up(v))
+        if lobes.isotropic:
+            splines = _views.spline_weights(_views.elevation(local), table.shape[-1] - 4)
+            constant, tables = table[..., 0, :] @ splines, table.reshape(-1, *table.shape[-2:])
+            rest = [incidence_integrals(t, local, v, lobes.degree, spare) for t in tables]
+        else:
+            c = slice_values(table, local, lobes)
+            constant, inverse = c[..., 0, :], zonal_inverse(lobes.degree, c.dtype)
+            rest = [fold_expansion(x, v, *inverse, spare) for x in c.reshape(-1, *c.shape[-2:])]
+        return times(constant, angle * np.sqrt(1 / (4 * np.pi))) + jnp.stack(rest).reshape(constant.shape)
+
+    nothing = lambda: jnp.zeros((*lobes.colour, len(local)), table.dtype)
+    return jax.lax.cond(jnp.all(dark), nothing, integrals)
+
+
+def _directional(
+    lobes: Lobes, table: Array, frame: Array, local: Array, outline: Loop, product: Float[Array, "*colour_n_m"]
+) -> Float[Array, "*colour p"]:
+    """Integrals of slices times the light's radiance, over its outline above the horizon."""
+    c, v = slice_values(table, local, lobes), on_sphere(clip(outline, outline[2]))
+    world = jnp.einsum("pij,jsp->isp", frame, v)
+    seen = _through(product, world, loop_solid_angle(v, 2 * np.pi, _up(v))).reshape(-1, c.shape[-2], v.shape[2])
+    seen = rotate_many(jnp.moveaxis(seen, 0, 1), jnp.swapaxes(frame, 1, 2), lobes.degree, lobes.isotropic)
+    seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *c.shape[-2:])
+    return jnp.sum(times(c, seen), axis=-2)
 
 
 @eqx.filter_jit
@@ -194,14 +226,6 @@ def _project(
     return in_tiles(project, points, size)
 
 
-def _outline(light: Light, position: Float[Array, "p 3"], frame: Float[Array, "p 3 3"]) -> tuple[Loop, Array]:
-    """The light above the horizon on the local sphere, and the sign of its radiance: see `_facing`."""
-    relative = light.points.T[:, :, None] - position.T[:, None]
-    local = jnp.einsum("pij,isp->jsp", frame, relative)
-    sign = jnp.where(jnp.max(local[2], axis=0) > 0, _facing(light, relative), 0)
-    return on_sphere(clip(local, local[2])), sign
-
-
 def _facing(light: Light, relative: Loop) -> Float[Array, " p"]:
     """-1 in front of a light, where its outline runs clockwise as seen from outside the sphere; 0 or 1 behind it."""
     outwards = jnp.cross(light.points, jnp.roll(light.points, -1, 0)).sum(axis=0)
@@ -213,13 +237,10 @@ def _up(v: Loop) -> Float[Array, "3 p"]:
     return jnp.broadcast_to(jnp.asarray([0, 0, 1], v.dtype)[:, None], (3, v.shape[2]))
 
 
-def _constant(c: Float[Array, "n p"], v: Loop, solid_angle: Array, axes: Array, degree: int) -> Float[Array, " p"]:
-    """Integrals of expansions, each over its loop: weights (inverse_l)^T c_l on moments about the axes."""
-    _, inverse = zonal_inverse(degree, c.dtype)
-    bands = [slice(l * l, (l + 1) ** 2) for l in range(degree + 1)]
-    scales = [1 / max(l * (l + 1), 1) for l in range(degree + 1)]  # for `fold`
-    weights = jnp.stack([jnp.asarray(inverse[b].T * s) @ c[b] for b, s in zip(bands, scales, strict=True)], axis=1)
-    return c[0] * (solid_angle * np.sqrt(1 / (4 * np.pi))) + _moments.fold(weights, axes, v, degree)
+def _local(frame: Float[Array, "p 3 3"], relative: Loop) -> Loop:
+    """frame^T relative, written out: XLA has no fast code for many small products."""
+    r = jnp.moveaxis(frame, 0, -1)
+    return jnp.stack([sum(r[i, j][None] * relative[i] for i in range(3)) for j in range(3)])
 
 
 def incident_radiance(light: Light) -> Float[Array, "*colour_n"]:

@@ -18,6 +18,7 @@ notation: s = the normal, or the direction mirrored at it; t = sin(theta_o) time
 the viewer's side (s = normal) or to the normal (s = mirror direction); psi = the angle from the frame's theta to t.
 """
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -33,7 +34,7 @@ from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import _tables, rotate
 from shisd.harmonics._rotation import rotate_many
 from shisd.shading import _views
-from shisd.shading._lobes import Lobes
+from shisd.shading._lobes import Lobes, check_lobes
 from shisd.shading._surface import in_tiles, shade_points
 
 _TILE = 2048  # pixels at a time
@@ -77,19 +78,13 @@ def prefilter(
     right within a factor of 2 on photographed maps.
     Channels are chosen from values, so not under jit, grad or vmap. There pass `like`, an earlier result: its channels
     are used again and only the tables are made, a pure function of `lobes` and `light_coefficients`, linear in each.
-    Cost: the light is turned to (3 (L+1))^2 frames for each of two charts, about 0.2 s at degree 30; the maps take
-    10 to 40 MB there, 1 MB at degree 8.
+    Cost: the light is turned to 18 (L+1)^2 frames for each of two charts. The maps hold about as many texels in all.
     Source: ISD15 Eq. 22, whose zonal maps this extends to orders m > 0.
     """
-    if not isinstance(lobes, Lobes):
-        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
-    if lobes.domain != "sphere":
-        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
+    check_lobes(lobes, everywhere=True)
     if not lobes.isotropic:
         raise ValueError("`lobes` are anisotropic, which no map of one direction can hold; use shade_environment.")
-    e, light_degree = _checks.coefficients("light_coefficients", light_coefficients)
-    if e.ndim > 2:
-        raise ValueError(f"`light_coefficients` must have shape [n] or [colour, n]; got {list(e.shape)}.")
+    e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
     if not tolerance > 0:
         raise ValueError(f"`tolerance` must be > 0; got {tolerance}.")
     degree = min(light_degree, lobes.degree)
@@ -109,10 +104,7 @@ def prefilter(
         raise ValueError(f"`like` must come from shading.prefilter at degree {degree}.")
     like = jax.lax.stop_gradient(_as_type(like, dtype))
     profiles, maps = _filter(c, e.reshape(-1, e.shape[-1]), like)
-    return PrefilteredLobes(
-        profiles, maps, like.order, like.reduce, like.expand, like.mirror, like.channels, like.error,
-        like.highest, (lobes.colour, e.shape[:-1]),
-    )  # fmt: skip
+    return dataclasses.replace(like, profiles=profiles, maps=maps, colours=(lobes.colour, e.shape[:-1]))
 
 
 def shade_prefiltered(

@@ -53,11 +53,14 @@ def spline_table(
     return jnp.where(jnp.broadcast_to(odd[:, None], (*scaled.shape[:-1], 1)), scaled @ odd_matrix, scaled @ even_matrix)
 
 
-def spline_weights(view: Float[Array, "p 3"], count: int) -> Float[Array, "coefs p"]:
-    """The B-splines at the elevation of each local view direction; beyond the horizon those at the horizon."""
-    sine = _sine(view)
-    theta = jnp.minimum(jnp.arctan2(sine, view[:, 2]), np.pi / 2)
-    j = jnp.arange(-2, count + 2, dtype=view.dtype)
+def elevation(view: Float[Array, "p 3"]) -> Float[Array, " p"]:
+    """The angle to the normal of local view directions; beyond the horizon that of the horizon."""
+    return jnp.minimum(jnp.arctan2(_sine(view), view[:, 2]), np.pi / 2)
+
+
+def spline_weights(theta: Float[Array, " p"], count: int) -> Float[Array, "coefs p"]:
+    """The B-splines at elevations."""
+    j = jnp.arange(-2, count + 2, dtype=theta.dtype)
     t = jnp.abs(theta[None, :] * (count / (np.pi / 2)) - 0.5 - j[:, None])
     return jnp.where(t < 1, (4 - 6 * t * t + 3 * t**3) / 6, jnp.maximum(2 - t, 0) ** 3 / 6)
 

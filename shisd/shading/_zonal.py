@@ -16,7 +16,7 @@ from shisd._numerics import normalize, times
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import _tables, sh_basis
-from shisd.shading._lobes import Lobes, lookup_table, slice_values
+from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
 from shisd.shading._surface import shade_points, shade_tiles, surface
 
 
@@ -37,10 +37,7 @@ def shade_zonal(
     Cost: (L+1)^2 harmonics per pixel where `shade_environment` rotates, about L^3 products.
     Source: ISD15 Eq. 4 and 22, for a light that is one rotated zonal function.
     """
-    if not isinstance(lobes, Lobes):
-        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
-    if lobes.domain != "sphere":
-        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
+    check_lobes(lobes, everywhere=True)
     a, z = _checks.vectors("axis", axis), _checks.real_array("zonal_coefficients", zonal_coefficients)
     if a.ndim != 1:
         raise ValueError(f"`axis` must have shape [3]; got {list(a.shape)}.")

@@ -18,13 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
 
+from shisd._numerics import dot
 from shisd.domains._integrate import loop_coefficients, zonal_inverse
 from shisd.domains._polygon import clip, loop_solid_angle, on_sphere
 from shisd.harmonics import _tables, sh_basis
 from shisd.shading import _views
 from shisd.shading._lobes import lookup_table
+from tests.bench import sh_rotation
 from tests.bench.polygons import line_coefficients
-from tests.truth import scipy_basis
 
 Vector = tuple  # three components
 
@@ -65,10 +66,6 @@ def _shifts(index, dtype) -> tuple:
 
 
 # ---- vectors
-
-
-def dot(a: Vector, b: Vector):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
@@ -412,7 +409,7 @@ class Slices(NamedTuple):
     def coefficients(self, degree: int, scene: Scene) -> jax.Array:
         view = jnp.stack([scene.sine, jnp.zeros_like(scene.sine), scene.cosine], axis=1)
         order = _tables.orders(degree)[_even(degree)]
-        c = self.table @ _views.spline_weights(view, self.table.shape[1] - 4)
+        c = self.table @ _views.spline_weights(_views.elevation(view), self.table.shape[1] - 4)
         return jnp.where(jnp.asarray(order > 0)[:, None], scene.sine * c, c)
 
 
@@ -454,36 +451,8 @@ def _world_coefficients(degree: int, scene: Scene) -> jax.Array:
 
 
 def turn(c: jax.Array, frame: tuple, degree: int) -> jax.Array:
-    """World to local coefficients [n, p], frame = (x, y, z) in world space: Z(-g) S Z(b) S Z(-a), S swaps y and z."""
-    x, y, z = frame
-    sine = jnp.sqrt(z[0] * z[0] + z[1] * z[1])
-    a, b, g = (z[0] / sine, -z[1] / sine), (z[2], sine), (-x[2] / sine, -y[2] / sine)
-    return _about_z(_swap(_about_z(_swap(_about_z(c, a, degree), degree), b, degree), degree), g, degree)
-
-
-def _about_z(c: jax.Array, angle: tuple, degree: int) -> jax.Array:
-    cosines, sines = [jnp.ones_like(angle[0]), angle[0]], [jnp.zeros_like(angle[0]), angle[1]]
-    for _ in range(2, degree + 1):
-        cosines.append(cosines[-1] * angle[0] - sines[-1] * angle[1])
-        sines.append(sines[-1] * angle[0] + cosines[-2] * angle[1])
-    m, l = _tables.orders(degree), _tables.bands(degree)
-    sign = jnp.asarray(-np.sign(m)[:, None], c.dtype)
-    return jnp.stack(cosines)[np.abs(m)] * c + sign * jnp.stack(sines)[np.abs(m)] * c[l * l + l - m]
-
-
-def _swap(c: jax.Array, degree: int) -> jax.Array:
-    bands = [jnp.asarray(s, c.dtype) @ c[l * l : (l + 1) ** 2] for l, s in enumerate(swap_matrices(degree))]
-    return jnp.concatenate(bands)
-
-
-@functools.cache
-def swap_matrices(degree: int) -> list[np.ndarray]:
-    """y_l(x, z, y) = S_l y_l(x, y, z), solved for at points, SciPy's harmonics."""
-    d = np.random.default_rng(0).normal(size=(8 * (degree + 1), 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    here, there = scipy_basis(d, degree), scipy_basis(d[:, [0, 2, 1]], degree)
-    bands = [slice(l * l, (l + 1) ** 2) for l in range(degree + 1)]
-    return [np.linalg.lstsq(here[:, b], there[:, b], rcond=None)[0].T for b in bands]
+    """World to local coefficients [n, p], frame = (x, y, z) in world space."""
+    return sh_rotation.rotated(c[:, None], jnp.stack([jnp.stack(axis) for axis in frame]), degree)[:, 0]
 
 
 def axial(degree: int, material: Slices, scene: Scene):
@@ -520,8 +489,8 @@ def axial_coefficients(edges: list, degree: int, rows: np.ndarray) -> jax.Array:
     for l in range(degree + 1):
         powers = legendre.leg2poly(np.eye(degree + 1)[l])
         zonal = sum(float(powers[n]) * area[n] for n in range(l % 2, l + 1, 2))
-        own = rows[(rows >= l * l) & (rows < (l + 1) ** 2)]
-        result.append(jnp.asarray(inverse[own]) @ zonal)
+        own = rows[(rows >= l * l) & (rows < (l + 1) ** 2)] - l * l
+        result.append(jnp.asarray(inverse[l][own]) @ zonal)
     return jnp.concatenate(result)
 
 

@@ -17,7 +17,6 @@ To add a family: a function of a Scene that returns its methods, listed in FAMIL
 
 import argparse
 import functools
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,6 +28,7 @@ import numpy as np
 from shisd import decomposition, harmonics, models, reference, shading
 from tests.bench import lobes, monte_carlo, sh_rotation, split_sum
 from tests.bench.harness import Method, Task
+from tests.bench.timing import timed
 
 SIDE, JUDGED = 128, 256
 STORED = Path(__file__).parent / "data" / "references_environments.npz"
@@ -107,25 +107,13 @@ def pixels():
     return tuple(a[order] for a in lobes.sphere_points(SIDE, SIDE))
 
 
-_seen = set()
-
-
-def timed(kind: str, function):
-    """A result and the seconds of a call, after one that compiles for the first of its kind."""
-    if kind not in _seen:
-        jax.block_until_ready(function())
-        _seen.add(kind)
-    start = time.perf_counter()
-    return jax.block_until_ready(function()), time.perf_counter() - start
-
-
 # --- ours
 
 
 @functools.cache
 def coefficients(name: str):
     """The map's coefficients to the highest degree that anything needs, and seconds."""
-    return timed("coefficients", lambda: environment(name).coefficients(255))
+    return timed(lambda: environment(name).coefficients(255), "coefficients")
 
 
 @functools.cache
@@ -137,7 +125,7 @@ def tables(material: str):
         bases[degree] = decomposition.RotatedZonalBasis(directions, degree)
     brdf, most = MATERIALS[material], bases[DEGREES[-1]]
     kind = type(brdf).__name__
-    table, seconds = timed(kind, lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64))
+    table, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64), kind)
     return {degree: _cut(table, basis) for degree, basis in bases.items()}, seconds
 
 
@@ -181,7 +169,7 @@ def sharp_table(material: str, degree: int):
     """Lobes of a higher degree, and seconds."""
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
     brdf = MATERIALS[material]
-    return timed(f"{type(brdf).__name__} {degree}", lambda: shading.tabulate_brdf(brdf, basis, quadrature=64 + degree))
+    return timed(lambda: shading.tabulate_brdf(brdf, basis, quadrature=64 + degree), f"{type(brdf).__name__} {degree}")
 
 
 def shade_prefiltered(parameters, normals, views):
@@ -197,7 +185,7 @@ def prefiltered(scene: Scene) -> list[Method]:
         for tolerance in scene.some((0.1, 0.03, 0.01, 0.003) if scene.glossy else (0.01,)):
             make = functools.partial(shading.prefilter, lobes, light, tolerance=tolerance)
             first = make()
-            filtered, filtering = timed(f"prefilter {degree} {first.maps.shape}", make)
+            filtered, filtering = timed(make, f"prefilter {degree} {first.maps.shape}")
             parameters = {"filtered": filtered, "maps": filtered.maps}
             forward, gradient = functions(shade_prefiltered, "maps")
             setting = f"tolerance {tolerance:g}"
@@ -212,7 +200,7 @@ def prefiltered(scene: Scene) -> list[Method]:
 @functools.cache
 def samplers(name: str):
     texels = np.asarray(environment(name).texels)
-    tables, seconds = timed("samplers", lambda: monte_carlo.light_tables(texels))
+    tables, seconds = timed(lambda: monte_carlo.light_tables(texels), "samplers")
     return {**tables, "shifts": monte_carlo.shifts(SIDE**2)}, seconds
 
 
@@ -280,7 +268,7 @@ def albedo(material: str):
     brdf = MATERIALS[material]
     if material == "clay":
         return brdf.albedo[None], 0.0
-    scale, seconds = timed("scale", lambda: split_sum.ggx_scale(float(brdf.alpha), COPPER))
+    scale, seconds = timed(lambda: split_sum.ggx_scale(float(brdf.alpha), COPPER), "scale")
     return jnp.asarray(scale, jnp.float32), seconds
 
 
@@ -291,7 +279,7 @@ def split_sums(scene: Scene) -> list[Method]:
     forward, gradient = functions(split_sum.radiance, "texels", glossy=scene.glossy)
     methods = []
     for height in scene.some((64, 128)):
-        texels, filtering = timed(f"filtered {height}", lambda height=height: split_sum.filtered(light, kernel, height))
+        texels, filtering = timed(lambda height=height: split_sum.filtered(light, kernel, height), f"filtered {height}")
         parameters = {"texels": texels, "scale": scale}
         setup = projection + seconds + filtering
         methods.append(Method("split sum", f"{height} x {2 * height} map", forward, parameters, gradient, setup))
@@ -300,7 +288,7 @@ def split_sums(scene: Scene) -> list[Method]:
 
 @functools.cache
 def pyramid(name: str):
-    return timed("pyramid", lambda: lobes.gaussian_pyramid(environment(name)))
+    return timed(lambda: lobes.gaussian_pyramid(environment(name)), "pyramid")
 
 
 @functools.cache
@@ -316,7 +304,7 @@ def make_fits():
     for material, brdf in MATERIALS.items():
         for count in (1, 3, 7):
             kind, name = f"{type(brdf).__name__}, {count} Gaussians", f"{material}, {count}"
-            table, seconds = timed(kind, lambda brdf=brdf, count=count: lobes.fit_table(brdf, count))
+            table, seconds = timed(lambda brdf=brdf, count=count: lobes.fit_table(brdf, count), kind)
             arrays |= {f"{name}: {part}": getattr(table, part) for part in PARTS} | {f"{name}: seconds": seconds}
             print(f"{name} Gaussians: {seconds:.2f} s", flush=True)
     np.savez_compressed(FITTED, **arrays)

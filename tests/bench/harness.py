@@ -14,6 +14,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from tests.bench.timing import interleaved
+
 HISTOGRAM = np.array([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, np.inf])  # of |error| over the RMS of the reference
 
 
@@ -72,7 +74,7 @@ def run(task: Task, seconds: float = 0.25) -> list[dict]:
         ("gradient", i): functools.partial(c.call, task.methods[i].parameters, *task.inputs)
         for i, c in gradient.items()
     }
-    times = _in_turn(calls, seconds)
+    times = {name: t.median for name, t in interleaved(calls, seconds=seconds).items()}
     scale = 1e6 / task.count
     rows = []
     for i, m in enumerate(task.methods):
@@ -215,19 +217,3 @@ def _peak_megabytes(call: Callable) -> float:
     before = read("VmRSS")
     jax.block_until_ready(call())
     return read("VmHWM") - before
-
-
-def _in_turn(calls: dict, seconds: float, least: int = 3, most: int = 30) -> dict:
-    """Median seconds of a call: all of them in turn, until the time is used up."""
-    runs = {name: [] for name in calls}
-    for call in calls.values():
-        jax.block_until_ready(call())
-    start = time.perf_counter()
-    for i in range(most):
-        if i >= least and time.perf_counter() - start > seconds * len(calls):
-            break
-        for name, call in calls.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(call())
-            runs[name].append(time.perf_counter() - begin)
-    return {name: float(np.median(t)) for name, t in runs.items()}

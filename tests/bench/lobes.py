@@ -28,7 +28,7 @@ from shisd.decomposition._kernels import gaussian_zonal
 from shisd.shading import _lobes, _surface, _views
 from tests.bench.equation_22 import local_frames
 from tests.bench.monte_carlo import arccos, arctan2
-from tests.bench.timing import interleaved
+from tests.bench.timing import interleaved, timed
 from tests.models.materials import GOLD_PAINT, NICKEL
 
 STEEPEST = np.radians(80)  # views of pictures and of slices that are judged
@@ -316,13 +316,6 @@ def sparse_table(brdf, degree, count):
         return decomposition.ZonalLobes(basis.directions[axes], weights[..., axes])
 
     return jax.lax.map(choose, jnp.asarray(_views.elevations(VIEWS), jnp.float32))
-
-
-def timed(function):
-    """A result, and the seconds of the second call."""
-    jax.block_until_ready(function())
-    start = time.perf_counter()
-    return jax.block_until_ready(function()), time.perf_counter() - start
 
 
 def methods(brdf, bases):

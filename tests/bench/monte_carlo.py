@@ -20,6 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from shisd._numerics import dot
+
 POOL = 256  # cells of the pool along each side of the unit square
 NUMBERS = 1 << 15  # samples of a tile
 
@@ -230,10 +232,6 @@ def tangents(n):
     a = -1 / (sign + z)
     b = x * y * a
     return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
-
-
-def dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def take(table, index):

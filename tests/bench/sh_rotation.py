@@ -9,8 +9,9 @@ busy cores. Coefficients stand before pixels, pixels in tiles. Slices are interp
 import jax.numpy as jnp
 import numpy as np
 
+from shisd._numerics import dot
 from shisd.harmonics import _tables
-from tests.bench.monte_carlo import dot, in_tiles
+from tests.bench.monte_carlo import in_tiles
 
 NUMBERS = 1 << 18  # coefficients turned at a time
 

@@ -125,6 +125,12 @@ def on_host(family: str, setting: str, value, *arguments, gradient=None) -> Meth
 # ---- inputs, float32 unless they say otherwise, and seeded
 
 
+def ducc_in_both(value, c: np.ndarray, turns: np.ndarray, w: np.ndarray) -> list[Method]:
+    """ducc0's rotation of real coefficients in both precisions."""
+    precisions = {"float32": np.complex64, "float64": np.complex128}
+    return [on_host("ducc0", name, value, to_complex(c).astype(dtype), turns, w) for name, dtype in precisions.items()]
+
+
 def normal(seed: int, *shape: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
@@ -512,10 +518,7 @@ def rotation(degree: int, quick: bool) -> Task:
         in_double("shisd", "rotate_many, float64", _rotate_many(degree), c, r, ours=True),
     ]
     if installed("ducc0"):
-        value = _ducc_rotations(degree)
-        for dtype in (np.complex64, np.complex128):
-            name = "float32" if dtype == np.complex64 else "float64"
-            methods.append(on_host("ducc0", name, value, to_complex(c).astype(dtype), zyz(r), w))
+        methods += ducc_in_both(_ducc_rotations(degree), c, zyz(r), w)
     if installed("e3nn_jax") and degree <= SMALL and not quick:
         turned = E3NN_TURN @ single @ E3NN_TURN.T
         methods.append(compiled("e3nn-jax", "float32", _e3nn_rotations(degree), c, turned, w))
@@ -534,10 +537,7 @@ def batch_rotation(degree: int, quick: bool) -> Task:
         in_double("shisd", "rotate_many, float64", _rotate_each(degree), c, r, ours=True),
     ]
     if installed("ducc0"):
-        value = _ducc_rotation(degree)
-        for dtype in (np.complex64, np.complex128):
-            name = "float32" if dtype == np.complex64 else "float64"
-            methods.append(on_host("ducc0", name, value, to_complex(c).astype(dtype), zyz(r[None]), w))
+        methods += ducc_in_both(_ducc_rotation(degree), c, zyz(r[None]), w)
     if installed("e3nn_jax") and degree <= SMALL and not quick:
         methods.append(compiled("e3nn-jax", "float32", _e3nn_rotation(degree), c, E3NN_TURN @ single @ E3NN_TURN.T, w))
     reference, error = judged("batch", degree)

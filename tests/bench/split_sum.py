@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import harmonics
+from shisd._numerics import dot
 from tests.bench.lobes import padded
-from tests.bench.monte_carlo import arccos, arctan2, dot, in_tiles, net, take
+from tests.bench.monte_carlo import arccos, arctan2, in_tiles, net, take
 
 VIEWS = 256  # cosines of the BRDF table
 

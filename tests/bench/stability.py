@@ -58,6 +58,15 @@ def row(case: str, what: str, ours: list, peer: str = "-", theirs: list | None =
     }  # fmt: skip
 
 
+def beside_monte_carlo(results: dict[str, list]) -> list[dict]:
+    """Two rows for every case, whose (value, gradient, estimate) are there for both precisions."""
+    rows = []
+    for name, both in results.items():
+        value, gradient, estimate = zip(*both, strict=True)
+        rows += [row(name, "value", value, "Monte Carlo", estimate), row(name, "gradient", gradient)]
+    return rows
+
+
 def cell(error) -> float | str:
     return error if isinstance(error, str) else float(error) if np.isfinite(error) else "NaN"
 
@@ -389,11 +398,7 @@ def shading_rows():
                     cell(slope_error([s[i] for s in slopes], tries, float(value))),
                     several([cell(largest(estimate, of_material))]),
                 ))  # fmt: skip
-    rows = []
-    for name, both in results.items():
-        value, gradient, estimate = zip(*both, strict=True)
-        rows += [row(name, "value", value, "Monte Carlo", estimate), row(name, "gradient", gradient)]
-    return rows
+    return beside_monte_carlo(results)
 
 
 def tabulated(brdf, dtype, **options):
@@ -521,11 +526,7 @@ def roughness_rows():
                     cell(slope_error([np.asarray(s, float) for s in slopes], tries, value)),
                     several([cell(largest(estimate.value[0], value))]),
                 ))  # fmt: skip
-    rows = []
-    for name, both in results.items():
-        value, gradient, estimate = zip(*both, strict=True)
-        rows += [row(name, "value", value, "Monte Carlo", estimate), row(name, "gradient", gradient)]
-    return rows
+    return beside_monte_carlo(results)
 
 
 def environment_truth(alpha, normal, view, light):

@@ -1,7 +1,7 @@
 """Interleaved timing: what is compared runs in turn, so a machine that speeds up or slows down does so for all."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 import jax
@@ -15,7 +15,9 @@ class Timing:
     best: float  # s
 
 
-def interleaved(methods: dict[str, Callable], *arguments, seconds: float = 1.0, rounds: int = 30) -> dict[str, Timing]:
+def interleaved(
+    methods: dict[Hashable, Callable], *arguments, seconds: float = 1.0, rounds: int = 30
+) -> dict[Hashable, Timing]:
     """Call every method twice, then all of them in turn until the time is used up; at least three rounds."""
     first, runs = {}, {name: [] for name in methods}
     for name, method in methods.items():
@@ -34,3 +36,15 @@ def _time(method: Callable, arguments: tuple) -> float:
     start = time.perf_counter()
     jax.block_until_ready(method(*arguments))
     return time.perf_counter() - start
+
+
+_seen: set[Hashable] = set()
+
+
+def timed(function: Callable, kind: Hashable = None):
+    """A result and the seconds of a call, after one that compiles: for every call, or for the first of a kind."""
+    if kind is None or kind not in _seen:
+        jax.block_until_ready(function())
+        _seen.add(kind)
+    start = time.perf_counter()
+    return jax.block_until_ready(function()), time.perf_counter() - start

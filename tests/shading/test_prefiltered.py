@@ -43,7 +43,7 @@ def lobes_of(material, dtype):
     return shading.tabulate_brdf(MATERIALS[material](), decomposition.RotatedZonalBasis(axes, DEGREE), views=32)
 
 
-@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("material", ["glossy", pytest.param("diffuse", marks=pytest.mark.slow)])
 def test_error_is_as_predicted(material, dtype, rng):
     lobes, e = lobes_of(material, dtype), light(rng).astype(dtype)
     n, v = (x.astype(dtype) for x in directions(rng, 4000))
@@ -68,6 +68,7 @@ def test_derivatives_where_frames_turn(x64, rng):
         check_grads(lambda n, v: shading.shade_prefiltered(filtered, n, v), (n, v), 1, ["fwd", "rev"], 1e-4, 1e-4, 1e-6)
 
 
+@pytest.mark.slow
 def test_tables_are_linear_in_light_and_material_under_jit(x64, rng):
     lobes, e = lobes_of("glossy", np.dtype("float64")), jnp.asarray(light(rng))
     first = shading.prefilter(lobes, e, tolerance=1e-3)

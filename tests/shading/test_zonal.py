@@ -25,7 +25,9 @@ def scene(rng, count, dtype):
     return tuple(a.astype(dtype) for a in (axis, z, normals, views, tangents))
 
 
-@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize(
+    "material", ["glossy", *(pytest.param(m, marks=pytest.mark.slow) for m in MATERIALS if m != "glossy")]
+)
 def test_it_is_the_light_of_these_coefficients(material, dtype, rng):
     lobes = tabulate(MATERIALS[material])
     axis, z, *where = scene(rng, 200, dtype)

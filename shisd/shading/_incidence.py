@@ -1,0 +1,109 @@
+"""Integrals over polygons of slices of isotropic materials, by zonal functions about axes in the plane of incidence.
+
+Such a slice is even across the plane of view and normal. So L+1 axes in that plane do what takes 2L+1 otherwise
+(`domains._integrate.incidence_inverse`), and what is interpolated over views depends on their elevation only.
+
+A view along the normal has no such plane. The value is right whichever is taken, since the slice is even across all.
+The derivative is not that of the formula, in which the plane then turns infinitely fast: the rule below has the limit.
+
+notation: theta = elevation of the view, s = sin(theta); frame x, y, z with z the normal and y across the plane; c_m =
+rows of the slice, of which c_m / s is smooth for m > 0; u = an outline in the frame given, v = in that of the plane.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+from shisd._numerics import safe_sqrt
+from shisd._typing import Array, Float
+from shisd.domains._integrate import fold_expansion, incidence_inverse
+from shisd.domains._moments import Loop
+from shisd.harmonics import _tables
+from shisd.shading import _views
+
+_STEEP = 0.01  # s up to which the plane turns too fast
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def incidence_integrals(
+    table: Float[Array, "n columns"], view: Float[Array, "p 3"], u: Loop, degree: int, spare: int
+) -> Float[Array, " p"]:
+    """Integrals, without their constants, of slices from `lookup_table` towards local unit views, over outlines.
+
+    The last `spare` edges seldom have a length.
+
+    Derivatives: the first exact for every view, along the normal too; those in the view along the sphere.
+    """
+    return _fold(_slices(table, _views.elevation(view), degree), _turned(u, *_azimuth(view)), spare)
+
+
+def _incidence_integrals_jvp(degree, spare, primals, tangents):
+    (table, view, u), (d_table, d_view, du) = primals, tangents
+    value = incidence_integrals(table, view, u, degree, spare)
+    theta, (cos, sin) = _views.elevation(view), _azimuth(view)
+    v, change, dv, across = _turned(u, cos, sin), jnp.zeros_like(value), jnp.zeros_like(u), None
+    if not isinstance(d_table, SymbolicZero):
+        in_table = lambda t: _fold(_slices(t, theta, degree), v, spare)
+        change += jax.jvp(in_table, (table,), (d_table,))[1]
+    if not isinstance(d_view, SymbolicZero):
+        dx, dy, dz = d_view.T
+        along, across = cos * dx + sin * dy, cos * dy - sin * dx
+        _, steeper = jax.jvp(lambda t: _slices(table, t, degree), (theta,), (jnp.ones_like(theta),))
+        change += _fold(steeper, v, spare) * (view[:, 2] * along - jnp.sin(theta) * dz)
+    if not isinstance(du, SymbolicZero):
+        dv += _turned(du, cos, sin)
+    if not (isinstance(du, SymbolicZero) and across is None):
+        change += _outline_moves(table, theta, v, dv, across, degree, spare)
+    return value, change
+
+
+incidence_integrals.defjvp(_incidence_integrals_jvp, symbolic_zeros=True)
+
+
+def _outline_moves(
+    table: Array, theta: Array, v: Loop, dv: Loop, across: Array | None, degree: int, spare: int
+) -> Array:
+    """Change of the integrals where v moves by dv and the view by `across`, at right angles to the plane."""
+
+    def moves(by: Loop, over_sine: bool) -> Array:
+        rows = _slices(table, theta, degree, over_sine=over_sine)
+        return jax.jvp(lambda v: _fold(rows, v, spare), (v,), (by,))[1]
+
+    if across is None:
+        return moves(dv, False)
+    # the plane turns by across / s, and v in it turns back
+    back, sine = jnp.stack([v[1], -v[0], jnp.zeros_like(v[0])]) * across[None, None], jnp.sin(theta)
+    steep = sine < _STEEP
+    dv += back * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]
+    back *= jnp.where(steep, 1, 0)[None, None].astype(back.dtype)
+    none, at_normal = lambda: jnp.zeros_like(theta), lambda: moves(back, True)
+    return moves(dv, False) + jax.lax.cond(jnp.any(steep), at_normal, none)
+
+
+def _slices(table: Array, theta: Array, degree: int, *, over_sine: bool = False) -> Float[Array, "rows p"]:
+    """Rows m >= 0 of the slices in the frame of the plane; `over_sine`, those with m > 0 over s, for m = 0 zeros."""
+    m = _tables.orders(degree)
+    rows = table[m >= 0] @ _views.spline_weights(theta, table.shape[1] - 4)
+    scale = (0.0, 1.0) if over_sine else (1.0, jnp.sin(theta)[None])
+    return rows * jnp.where(m[m >= 0][:, None] > 0, scale[1], scale[0])
+
+
+def _fold(rows: Float[Array, "rows p"], v: Loop, spare: int) -> Float[Array, " p"]:
+    degree = (math.isqrt(8 * len(rows) + 1) - 3) // 2  # rows are (L+1)(L+2)/2
+    return fold_expansion(rows, v, *incidence_inverse(degree, rows.dtype), spare)
+
+
+def _azimuth(view: Float[Array, "p 3"]) -> tuple[Array, Array]:
+    sine = safe_sqrt(view[:, 0] ** 2 + view[:, 1] ** 2)
+    off = sine > 0
+    safe = jnp.where(off, sine, 1)
+    return jnp.where(off, view[:, 0] / safe, 1), view[:, 1] / safe
+
+
+def _turned(u: Loop, cos: Array, sin: Array) -> Loop:
+    """The frame turned about z to this azimuth, and u in it."""
+    cos, sin = cos[None], sin[None]
+    return jnp.stack([cos * u[0] + sin * u[1], cos * u[1] - sin * u[0], u[2]])
