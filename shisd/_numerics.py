@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from shisd._typing import Array, Float
 
@@ -66,6 +67,11 @@ def times(a: Array, b: Array) -> Array:
     """Products of arrays whose axes broadcast from the last one, whatever their number."""
     shape = jnp.broadcast_shapes(a.shape, b.shape)
     return jnp.broadcast_to(a, shape) * jnp.broadcast_to(b, shape)
+
+
+def rows_of(x: Float[Array, " p"], factors: np.ndarray) -> Float[Array, "n p"]:
+    """x times every factor, as a product of matrices: its transpose is one too, not a sum, which XLA does slowly."""
+    return jnp.asarray(factors[:, None], x.dtype) @ x[None]
 
 
 def safe_sqrt(x: Array) -> Array:

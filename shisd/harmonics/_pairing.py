@@ -19,13 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from shisd._numerics import rows_of
 from shisd._typing import Array, Float
 from shisd.harmonics import _tables
-from shisd.harmonics._rotation import QUARTER, rates, turns
+from shisd.harmonics._rotation import QUARTER, rates, swapped_series, turns
 
+_NEAR = 0.01  # sine of the angle to the pole
 _DEGREES_TOGETHER = 4  # more make fewer and larger products, with more zeros in them
 
 Parts = tuple[Array, ...]  # xa, ya, xb, yb
+Bands = dict[int, np.ndarray]  # by offset, diagonals [degrees, to] of matrices that join neighbouring orders
+Series = tuple[Array, ...]  # of even, then of odd multiples of g
 Waves = list[Array]  # cosines and sines [L+1, p] of the multiples of an angle
 
 
@@ -37,8 +41,8 @@ class _Block(NamedTuple):
     plus: np.ndarray  # where the coefficients are, A then B; (L+1)^2 where there is none
     minus: np.ndarray
     swap: tuple[np.ndarray, ...]  # J: xa from xa, ya from xb, xb from ya, yb from yb
-    about_x: tuple[np.ndarray, ...]  # rates of rotation: xa from yb, ya from xb, xb from ya, yb from xa
-    about_y: tuple[np.ndarray, ...]  # xa from xb, ya from yb, xb from xa, yb from ya
+    about_x: tuple[Bands, ...]  # rates of rotation: xa from yb, ya from xb, xb from ya, yb from xa
+    about_y: tuple[Bands, ...]  # xa from xb, ya from yb, xb from xa, yb from ya
 
 
 @functools.cache
@@ -55,11 +59,12 @@ def _blocks(degree: int) -> tuple[_Block, ...]:
             xa, xb = (np.where(k <= l, l * l + l + k, none) for k in (a, b))
             ya, yb = (np.where((k <= l) & (k > 0), l * l + l - k, none) for k in (a, b))
             part = functools.partial(_part, degrees, none)
+            near = lambda *which, part=part: _diagonals(part(*which))
             blocks.append(_Block(
                 a, b, np.concatenate([xa.ravel(), xb.ravel()]), np.concatenate([ya.ravel(), yb.ravel()]),
                 (part(exchange, xa, xa), part(exchange, ya, xb), part(exchange, xb, ya), part(exchange, yb, yb)),
-                (part(about_x, xa, yb), part(about_x, ya, xb), part(about_x, xb, ya), part(about_x, yb, xa)),
-                (part(about_y, xa, xb), part(about_y, ya, yb), part(about_y, xb, xa), part(about_y, yb, ya)),
+                (near(about_x, xa, yb), near(about_x, ya, xb), near(about_x, xb, ya), near(about_x, yb, xa)),
+                (near(about_y, xa, xb), near(about_y, ya, yb), near(about_y, xb, xa), near(about_y, yb, ya)),
             ))  # fmt: skip
     return tuple(blocks)
 
@@ -72,6 +77,16 @@ def _part(
     return np.stack([
         np.pad(matrices[l], (0, 1))[np.ix_(cut(l, t), cut(l, s))] for l, t, s in zip(degrees, to, source, strict=True)
     ])  # fmt: skip
+
+
+def _diagonals(matrices: np.ndarray) -> Bands:
+    _, rows, columns = matrices.shape
+    diagonals = {}
+    for offset in (-1, 0, 1):
+        i = np.arange(max(0, -offset), min(rows, columns - offset))
+        diagonals[offset] = np.zeros((len(matrices), rows))
+        diagonals[offset][:, i] = matrices[:, i, i + offset]
+    return {offset: d for offset, d in diagonals.items() if d.any()}
 
 
 def _generators(degree: int) -> list[list[np.ndarray]]:
@@ -95,14 +110,25 @@ def rows(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return plus, minus, np.concatenate(k).astype(np.int32)
 
 
+def turned_series(c: Float[Array, "f n"], degree: int) -> Series:
+    """J Z(g) c of expansions as `pair_many` takes it: matrices [f, cosines and sines of multiples of g, coefficients].
+
+    Even multiples meet coefficients of m >= 0 of even degrees and of m < 0 of odd degrees, odd multiples the others.
+    """
+    series = jnp.pad(jnp.moveaxis(swapped_series(c, degree), 0, -1), ((0, 0), (0, 0), (0, 1)))
+    chosen = [[b.plus if b.a[0] == k else b.minus for b in _blocks(degree)] for k in range(min(2, degree + 1))]
+    parts = [jnp.concatenate([series[:, k : degree + 1 : 2], series[:, degree + 1 + k :: 2]], axis=1) for k in range(2)]
+    return tuple(part[..., np.concatenate(index)] for part, index in zip(parts, chosen, strict=False))
+
+
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
 def pair_many(
-    x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], series: Float[Array, "n f2 k"], r: Float[Array, "p 3 3"],
+    x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], series: Series, r: Float[Array, "p 3 3"],
     degree: int, upright: bool = False,
 ) -> Float[Array, "f3 p"]:  # fmt: skip
-    """sum over n of s_n (R c)_n, for an s of every rotation, ordered as `rows` says, and `swapped_series` of a c.
+    """sum over n of s_n (R c)_n, for an s of every rotation, ordered as `rows` says, and `turned_series` of a c.
 
-    Of the numbers of colours f and f2 one may be 1. `upright` promises that R z has y = 0 <= x.
+    Of the numbers of colours of s and c one may be 1. `upright` promises that R z has y = 0 <= x.
     Derivatives: exact wherever the pole stays in place, to every order.
     """
     a, b, g = turns(r, max(degree, 1))
@@ -120,7 +146,7 @@ def _pair_many_jvp(degree, upright, primals, tangents):
             turning = _turning(lobe, [-w for w in rates(r, dr)], degree)
             moved = [tuple(p + q for p, q in zip(s, t, strict=True)) for s, t in zip(moved, turning, strict=True)]
         change += _pair_away_from_pole(moved, series, r, degree)
-    if not isinstance(d_series, SymbolicZero):
+    if not any(isinstance(t, SymbolicZero) for t in d_series):
         change += _pair_away_from_pole(lobe, d_series, r, degree)
     return value, change
 
@@ -128,39 +154,44 @@ def _pair_many_jvp(degree, upright, primals, tangents):
 pair_many.defjvp(_pair_many_jvp, symbolic_zeros=True)
 
 
-def _pair_away_from_pole(s: list[Parts], series: Array, r: Float[Array, "p 3 3"], degree: int) -> Array:
+def _pair_away_from_pole(s: list[Parts], series: Series, r: Float[Array, "p 3 3"], degree: int) -> Array:
     """`pair_many` with smooth angles: where R nearly keeps the z axis, s . R c = Q s . Q R c with Q, a quarter turn."""
-    near = r[:, 2, 2] ** 2 > 0.5
-    a, b, g = turns(jnp.where(near[:, None, None], jnp.asarray(QUARTER, r.dtype) @ r, r), max(degree, 1))
-    here = near[None, None, None]
-    turned = [(xa, -ya, xb, -yb) for xa, ya, xb, yb in _swapped(s, degree)]
-    s = [tuple(jnp.where(here, q, p) for p, q in zip(*both, strict=True)) for both in zip(s, turned, strict=True)]
-    return _pair(s, series, a, b, g, degree)
+    near = r[:, 2, 2] ** 2 > 1 - _NEAR**2
+
+    def away() -> tuple[list[Parts], Waves, Waves]:
+        a, b, g = turns(jnp.where(near[:, None, None], jnp.asarray(QUARTER, r.dtype) @ r, r), max(degree, 1))
+        here = near[None, None, None]
+        turned = [(xa, -ya, xb, -yb) for xa, ya, xb, yb in _swapped(s, degree)]
+        t = [tuple(jnp.where(here, q, p) for p, q in zip(*both, strict=True)) for both in zip(s, turned, strict=True)]
+        return _turned(t, a[0], -a[1], degree), b, g
+
+    def as_it_is() -> tuple[list[Parts], Waves, Waves]:
+        a, b, g = turns(r, max(degree, 1))
+        return _turned(s, a[0], -a[1], degree), b, g  # where a = 0, its derivative is not
+
+    s, b, g = jax.lax.cond(jnp.any(near), away, as_it_is)
+    return _pair(s, series, None, b, g, degree)
 
 
-def _pair(s: list[Parts], series: Array, a: Waves | None, b: Waves, g: Waves, degree: int) -> Float[Array, "f3 p"]:
+def _pair(s: list[Parts], series: Series, a: Waves | None, b: Waves, g: Waves, degree: int) -> Float[Array, "f3 p"]:
     """(Z(b) J Z(-a) s) . (J Z(g) c)."""
     if a is not None:
         s = _turned(s, a[0], -a[1], degree)
     s = _turned(_swapped(s, degree), b[0], b[1], degree)
-    series = jnp.pad(series, ((0, 1), (0, 0), (0, 0)))
-    colours = range(s[0][0].shape[2])
     totals = []
-    for k in range(min(2, degree + 1)):  # even multiples of g meet x of even and y of odd degrees; and conversely
-        kept, index = [], []
-        for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True):
-            same = block.a[0] == k
-            kept += (xa, xb) if same else (ya, yb)
-            index.append(block.plus if same else block.minus)
-        factors = series[np.concatenate(index)]
-        factors = jnp.concatenate([factors[..., k : degree + 1 : 2], factors[..., degree + 1 + k :: 2]], axis=-1)
+    for k, matrices in enumerate(series):
+        kept = [parts[i + (block.a[0] != k)] for block, parts in zip(_blocks(degree), s, strict=True) for i in (0, 2)]
+        lobe = jnp.concatenate([z.reshape(-1, *z.shape[2:]) for z in kept])
         waves = jnp.concatenate([g[0][k::2], g[1][k::2]])
-        lobe = [jnp.concatenate([z[:, :, i].reshape(-1, z.shape[-1]) for z in kept]) for i in colours]
-        if len(lobe) == 1:
-            sums = jnp.einsum("nfk,np->fkp", factors, lobe[0])
+        # flat products of matrices, whose transposes are such too, and sums as products with ones
+        if lobe.shape[1] == 1:
+            sums = matrices.reshape(-1, len(lobe)) @ lobe[:, 0]
         else:
-            sums = jnp.stack([factors[:, min(i, factors.shape[1] - 1)].T @ lobe[i] for i in colours])
-        totals.append(jnp.sum(sums * waves[None], axis=1))
+            matrices = jnp.broadcast_to(matrices, (lobe.shape[1], *matrices.shape[1:]))
+            sums = jnp.concatenate([m @ lobe[:, i] for i, m in enumerate(matrices)])
+        sums = (sums.reshape(-1, *waves.shape) * waves[None]).reshape(sums.shape)
+        ones = np.kron(np.eye(len(sums) // len(waves)), np.ones(len(waves)))
+        totals.append(jnp.asarray(ones, sums.dtype) @ sums)
     return functools.reduce(jnp.add, totals)
 
 
@@ -188,11 +219,12 @@ def _turning(s: list[Parts], about: list[Array], degree: int) -> list[Parts]:
     """G s of rotation at these rates [p] about x, y and z."""
     changes = []
     for block, (xa, ya, xb, yb) in zip(_blocks(degree), s, strict=True):
-        wx, wy, wz = (w[None, None, None] for w in about)
         a, b = (jnp.asarray(k[None, :, None, None], xa.dtype) for k in (block.a, block.b))
-        about_x, about_y = _product(block.about_x, (yb, xb, ya, xa)), _product(block.about_y, (xb, yb, xa, ya))
+        about_x, about_y = _neighbours(block.about_x, (yb, xb, ya, xa)), _neighbours(block.about_y, (xb, yb, xa, ya))
         about_z = (-a * ya, a * xa, -b * yb, b * xb)
-        changes.append(tuple(wx * p + wy * q + wz * r for p, q, r in zip(about_x, about_y, about_z, strict=True)))
+        rates = [[rows_of(w, np.ones(x[..., 0].size)).reshape(x.shape) for w in about] for x in (xa, xb)]
+        terms = zip(about_x, about_y, about_z, (rates[0], rates[0], rates[1], rates[1]), strict=True)
+        changes.append(tuple(wx * x + wy * y + wz * z for x, y, z, (wx, wy, wz) in terms))
     return changes
 
 
@@ -207,3 +239,17 @@ def _turned(s: list[Parts], cos: Array, sin: Array, degree: int) -> list[Parts]:
 
 def _product(matrices: tuple[np.ndarray, ...], parts: Parts) -> Parts:
     return tuple(jnp.einsum("lij,ljfp->lifp", jnp.asarray(m, x.dtype), x) for m, x in zip(matrices, parts, strict=True))
+
+
+def _neighbours(diagonals: tuple[Bands, ...], parts: Parts) -> Parts:
+    return tuple(
+        sum(jnp.asarray(d[:, :, None, None], x.dtype) * _shifted(x, offset, d.shape[1]) for offset, d in bands.items())
+        for bands, x in zip(diagonals, parts, strict=True)
+    )
+
+
+def _shifted(x: Float[Array, "l k f p"], offset: int, size: int) -> Float[Array, "l k2 f p"]:
+    """Rows k + offset of x for `size` rows k, zeros where there are none."""
+    first, last = max(0, offset), min(x.shape[1], size + offset)
+    before = max(0, -offset)
+    return jnp.pad(x[:, first:last], ((0, 0), (before, size - before - (last - first)), (0, 0), (0, 0)))

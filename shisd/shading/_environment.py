@@ -16,8 +16,7 @@ from jax.typing import ArrayLike
 from shisd import _checks
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
-from shisd.harmonics._pairing import pair_many
-from shisd.harmonics._rotation import swapped_series
+from shisd.harmonics._pairing import pair_many, turned_series
 from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import shade_points, shade_tiles, surface
 
@@ -60,7 +59,7 @@ def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, e: Float[Array, "*c n"], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     degree = _checks.degree_of(e.shape[-1])
-    look_up, series = slice_orders(lobes, degree), swapped_series(e.reshape(-1, e.shape[-1]), degree)
+    look_up, series = slice_orders(lobes, degree), turned_series(e.reshape(-1, e.shape[-1]), degree)
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
         to_local = jnp.swapaxes(frame, 1, 2)

@@ -121,11 +121,15 @@ def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], t
     plus, minus = (jnp.swapaxes(table[:, index], 0, 1) for index in signs)
     spread = jnp.asarray(k[:, None] == np.arange(max(degree, 1) + 1), table.dtype)
 
+    def product(table: Float[Array, "rows colours columns"], factors: Float[Array, "columns p"]) -> Array:
+        flat = table.reshape(-1, table.shape[-1])  # a product of matrices, and so is its transpose
+        return (flat @ factors).reshape(*table.shape[:2], -1)
+
     def look_up(view: Float[Array, "p 3"]) -> tuple[Array, Array]:
         factors = _lookup_factors(view, lobes)
-        x = jnp.tensordot(plus, factors, 1)
+        x = product(plus, factors)
         if not lobes.isotropic:
-            return x, jnp.tensordot(minus, factors, 1)
+            return x, product(minus, factors)
         # a product with a 0-1 matrix, whose transpose is one too: that of an indexed copy would be slow
         cos, sin = ((spread @ f)[:, None] for f in _views.azimuth_factors(view, max(degree, 1) + 1))
         return cos * x, sin * x

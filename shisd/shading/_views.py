@@ -11,10 +11,11 @@ with j = -2 ... V+1, so that every theta in [0, pi/2] sees four of them.
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd._numerics import angle_multiples, safe_sqrt
+from shisd._numerics import angle_multiples, rows_of, safe_sqrt
 from shisd._typing import Array, Float
 
 
@@ -58,23 +59,55 @@ def elevation(view: Float[Array, "p 3"]) -> Float[Array, " p"]:
     return jnp.minimum(jnp.arctan2(_sine(view), view[:, 2]), np.pi / 2)
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def spline_weights(theta: Float[Array, " p"], count: int) -> Float[Array, "coefs p"]:
     """The B-splines at elevations."""
-    j = jnp.arange(-2, count + 2, dtype=theta.dtype)
-    t = jnp.abs(theta[None, :] * (count / (np.pi / 2)) - 0.5 - j[:, None])
+    t = jnp.abs(_to_nodes(theta, count))
     return jnp.where(t < 1, (4 - 6 * t * t + 3 * t**3) / 6, jnp.maximum(2 - t, 0) ** 3 / 6)
 
 
+@spline_weights.defjvp
+def _spline_weights_jvp(count, primals, tangents):
+    (theta,), (d_theta,) = primals, tangents
+    t = _to_nodes(theta, count)
+    size = jnp.abs(t)
+    slope = jnp.where(size < 1, (1.5 * size - 2) * t, -0.5 * jnp.sign(t) * jnp.maximum(2 - size, 0) ** 2)
+    return spline_weights(theta, count), slope * rows_of(d_theta, np.full(count + 4, count / (np.pi / 2)))
+
+
+def _to_nodes(theta: Float[Array, " p"], count: int) -> Float[Array, "coefs p"]:
+    """Elevations as numbers of intervals from each node."""
+    j = jnp.arange(-2, count + 2, dtype=theta.dtype)
+    return theta[None, :] * (count / (np.pi / 2)) - 0.5 - j[:, None]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def azimuth_factors(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array, "k p"], Float[Array, "k p"]]:
     """sin(theta) cos(k phi) and sin(theta) sin(k phi) for k = 1 ... count-1, after 1 and 0 for k = 0."""
-    x, y = view[:, 0], view[:, 1]
+    x, y = view[None, :, 0], view[None, :, 1]
+    cos, sin = _azimuth_multiples(view, max(count - 1, 1))
+    real = jnp.concatenate([jnp.ones_like(x), x * cos - y * sin])  # (x, y) = sin(theta) (cos, sin)(phi)
+    return real[:count], jnp.concatenate([jnp.zeros_like(x), x * sin + y * cos])[:count]
+
+
+@azimuth_factors.defjvp
+def _azimuth_factors_jvp(count, primals, tangents):
+    (view,), (d_view,) = primals, tangents
+    cos, sin = _azimuth_multiples(view, max(count, 2))
+    dx, dy = d_view[:, 0], d_view[:, 1]
+    k = np.arange(count)
+    along = rows_of(cos[1] * dx + sin[1] * dy, np.minimum(k, 1))  # d sin(theta)
+    across = rows_of(cos[1] * dy - sin[1] * dx, k)  # sin(theta) k d phi
+    cos, sin = cos[:count], sin[:count]
+    return azimuth_factors(view, count), (cos * along - sin * across, sin * along + cos * across)
+
+
+def _azimuth_multiples(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array, "k p"], Float[Array, "k p"]]:
+    """cos(k phi) and sin(k phi), with phi = 0 at the normal."""
     sine = _sine(view)
     off = sine > 0
     safe = jnp.where(off, sine, 1)
-    cos, sin = angle_multiples(jnp.where(off, x / safe, 1), y / safe, max(count - 1, 1))
-    x, y = x[None], y[None]
-    real = jnp.concatenate([jnp.ones_like(x), x * cos - y * sin])  # (x, y) = sin(theta) (cos, sin)(phi)
-    return real[:count], jnp.concatenate([jnp.zeros_like(x), x * sin + y * cos])[:count]
+    return angle_multiples(jnp.where(off, view[:, 0] / safe, 1), view[:, 1] / safe, count)
 
 
 def _sine(view: Float[Array, "p 3"]) -> Float[Array, " p"]:

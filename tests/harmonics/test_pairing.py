@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from shisd import harmonics
 from shisd.harmonics import _pairing
-from shisd.harmonics._rotation import swapped_series
 from tests.truth import scipy_basis
 
 
@@ -37,7 +36,7 @@ def test_products_with_turned_expansions(degree, colours, dtype, rng):
         values = scipy_basis(w, degree) @ s[..., i].T, scipy_basis(w @ turn, degree) @ c.T  # (R c)(w) = c(R^T w)
         expected[:, i] = np.einsum("p,pf,pf->f", area, *np.broadcast_arrays(*values))
     x, y = in_order(s.astype(dtype), degree)
-    pair = jax.jit(lambda x, y, c, r: _pairing.pair_many(x, y, swapped_series(c, degree), r, degree))
+    pair = jax.jit(lambda x, y, c, r: _pairing.pair_many(x, y, _pairing.turned_series(c, degree), r, degree))
     got = pair(x, y, jnp.asarray(c, dtype), jnp.asarray(r, dtype))
     assert got.dtype == dtype
     scale = np.sqrt(np.sum(s**2, axis=1).max() * np.sum(c**2, axis=1).max())
@@ -60,6 +59,6 @@ def test_derivatives_along_the_group(start, x64, rng):
             terms.append(terms[-1] @ k / i)
         return (sum(terms) @ r0)[None]
 
-    series = lambda c: swapped_series(jnp.asarray(c), degree)
+    series = lambda c: _pairing.turned_series(jnp.asarray(c), degree)
     value = jax.jit(lambda w, x, c: _pairing.pair_many(jnp.asarray(x), y, series(c), turned(w), degree))
     check_grads(value, (jnp.zeros(3), x, c), order=2, modes=["fwd", "rev"], atol=1e-5, rtol=1e-5)
