@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -131,6 +132,7 @@ def test_hard_cases(name, dtype):
         np.testing.assert_allclose(gradient(points), gradient(points + lift), atol=2e-5 * scale)
 
 
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
 def test_light_by_direction(dtype, rng):
     """A profile at the light, and distant light through the same outline; in front, and from behind nothing."""
     position, normal, view = scene(rng, 6)
@@ -165,6 +167,7 @@ def test_a_uniform_profile_and_several_portals(rng):
     np.testing.assert_allclose(got, 2 * plain, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
 def test_projected_light(dtype, rng):
     """Coefficients of what a light sends to a point, against quadrature; several points and colours."""
     position = scene(rng, 4)[0].astype(dtype)
@@ -218,6 +221,25 @@ def test_derivatives(x64, rng):
     check_grads(radiance, arguments, order=1, rtol=1e-6, atol=1e-8)
     below = lambda points: jnp.sum(radiance(points, 1.0, position[:1], normal[:1], view[:1]))
     np.testing.assert_array_equal(jax.grad(below)(jnp.asarray(QUAD)), 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sine", [0.0, 1e-7, 0.009, 0.011], ids="s={}".format)
+def test_derivatives_of_views_near_the_normal(sine, x64, rng):
+    """Where the plane of incidence turns ever faster, on both sides of where its rule changes; in the material too."""
+    position, normal, _ = scene(rng, 4)
+    lobes, azimuth = lobes_of("sharp", 6, "float64"), rng.uniform(0, 2 * np.pi, (4, 1))
+    x = unit(np.cross(normal, [0.3, 0.5, -0.7]))
+    view = normal + sine * (np.cos(azimuth) * x + np.sin(azimuth) * np.cross(normal, x))
+
+    def radiance(weights, points, view, normal):
+        material = eqx.tree_at(lambda m: m.weights, lobes, jnp.asarray(weights))
+        return shading.shade_polygon(material, models.PolygonLight(points), position[2:], normal[2:], view[2:])
+
+    arguments = (lobes.weights, QUAD, view, normal)
+    for i, x in enumerate(arguments):  # a change of all weights is rough in the view: not both at a time
+        only = lambda x, i=i: radiance(*arguments[:i], x, *arguments[i + 1 :])
+        check_grads(only, (jnp.asarray(x),), order=1, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow

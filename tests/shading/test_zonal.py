@@ -25,6 +25,7 @@ def scene(rng, count, dtype):
     return tuple(a.astype(dtype) for a in (axis, z, normals, views, tangents))
 
 
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
 @pytest.mark.parametrize(
     "material", ["glossy", *(pytest.param(m, marks=pytest.mark.slow) for m in MATERIALS if m != "glossy")]
 )
