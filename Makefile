@@ -14,7 +14,7 @@ help:
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests: examples, notebooks, convergence"
 	@echo "make lint       ruff and pyright"
-	@echo "make report     speed against error, beside other methods; QUICK=1 for a few of them; to output/report"
+	@echo "make report     speed against error, beside other methods, to output/report; QUICK=1 for a few of them, README=1 also there"
 	@echo "make bench      studies behind the choices of the library: axes, kernels, recurrences"
 	@echo "make clean      remove .venv and output"
 
@@ -34,7 +34,7 @@ lint: $(VENV)/.test
 ALLOCATOR := MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000
 
 report: $(VENV)/.bench
-	$(ALLOCATOR) $(RUN) -m tests.bench.report $(if $(QUICK),--quick)
+	$(ALLOCATOR) $(RUN) -m tests.bench.report $(if $(QUICK),--quick) $(if $(README),--readme)
 
 bench: $(VENV)/.test
 	$(ALLOCATOR) $(RUN) -m tests.bench.run --readme

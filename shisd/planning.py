@@ -255,9 +255,10 @@ class Table(Path):
 
     @staticmethod
     def cost(material, light, degree):
-        n = (degree + 1) ** 2
-        first = 2 * (degree + 1) * n  # the first turn, of coefficients that all pixels share
-        return _lookup_cost(material, degree) + light.colours * (first + _bands_squared(degree)) + n * light.colours
+        series = (degree + 1) ** 3  # of one angle, which all pixels share
+        exchange = _bands_squared(degree) / 4
+        colours = max(material.colours, light.colours)
+        return _lookup_cost(material, degree) + series * (colours + material.isotropic) + material.colours * exchange
 
     @classmethod
     def make(cls, material, tables, lights, degree):
@@ -283,8 +284,9 @@ class Polygon(Path):
     def cost(material, light, degree):
         if light.light_degree:
             return _product_cost(material, light, degree)
-        moments = 12 * len(light.light.points) * (degree + 1) * (2 * degree + 1)
-        weights = (degree + 1) ** 2 * (2 * degree + 1)
+        axes, rows = _axes_and_rows(material, degree)
+        moments = 12 * len(light.light.points) * (degree + 1) * axes
+        weights = rows * axes
         return _lookup_cost(material, degree) + material.colours * (moments + weights)
 
     @classmethod
@@ -616,7 +618,12 @@ def _join(
 
 def _lookup_cost(material: _Material, degree: int) -> float:
     azimuths = 1 if material.isotropic else max(32, 2 * degree + 4) + 2  # cosines and sines
-    return float(material.colours * (material.views + 4) * azimuths * (degree + 1) ** 2)
+    return float(material.colours * (material.views + 4) * azimuths * _axes_and_rows(material, degree)[1])
+
+
+def _axes_and_rows(material: _Material, degree: int) -> tuple[int, int]:
+    """Axes that span the slices, and their coefficients; those of isotropic materials are even across a plane."""
+    return (degree + 1, (degree + 1) * (degree + 2) // 2) if material.isotropic else (2 * degree + 1, (degree + 1) ** 2)
 
 
 def _product_cost(material: _Material, light: _Local, degree: int) -> float:

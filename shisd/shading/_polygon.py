@@ -56,12 +56,14 @@ def shade_polygon(
     Returns [..., *colour] in the unit of the emission. What lies below the horizon of a point is cut off; a light
     wholly below it, seen from behind, or whose plane holds the point, adds 0, with gradient 0. A view below the horizon
     gives 0.
-    Derivatives: in every floating argument: positions, outline and emission of the lights, material, frame.
+    Derivatives: in every floating argument: positions, outline and emission of the lights, material, frame; the first
+    exact for views along the normal as well, second ones not there.
     Accuracy: exact for the tabulated slice, to 1e-12 in float64 and 3e-5 of the largest radiance in float32. Against
     quadrature of the material itself, with domain="upper" and degree 20: relative RMSE below 3e-5 for Lambertian, 1e-4
     for GGX of alpha 0.5.
-    Cost: moments at 2L+1 axes for every pixel, light and colour of the material; of lights with a profile, that of
-    `shade_portal`. Memory: one tile of 1024 pixels.
+    Cost: moments at L+1 axes, 2L+1 for anisotropic materials, for every pixel, light and colour of the material; half
+    as many edges again where the horizon cuts a light in any of 1024 pixels that follow each other, nothing where it is
+    dark in all; of lights with a profile, that of `shade_portal`. Memory: one tile of 1024 pixels.
     """
     return _shade_lights(lobes, light, PolygonLight, "light", positions, normals, views, tangents)
 

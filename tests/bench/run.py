@@ -18,14 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, domains, harmonics, models, reference, shading
+from shisd import decomposition, domains, models, reference, shading
 from shisd.domains import _moments
-from shisd.domains._integrate import loop_coefficients
-from shisd.domains._polygon import loop_solid_angle
 from shisd.harmonics import _tables
 from tests.bench import conditioning, equation_22, lobes, native, polygons
 from tests.bench.timing import interleaved
-from tests.truth import scipy_basis, triangle_rule, zonal_moments
+from tests.truth import zonal_moments
 
 POINTS = 10_000
 PIXELS = 128 * 128
@@ -33,108 +31,6 @@ PIXELS = 128 * 128
 
 def unit(x):
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
-
-
-def competitor(degree):
-    """sphericart for JAX where it is installed, else its NumPy interface (the same C++): values, and with gradients."""
-    try:
-        import sphericart.jax as sj
-
-        values = jax.jit(lambda d: sj.spherical_harmonics(d, degree))
-        return (
-            "sphericart-jax",
-            values,
-            jax.jit(jax.value_and_grad(lambda d, w: jnp.vdot(sj.spherical_harmonics(d, degree), w))),
-        )
-    except ImportError:
-        import sphericart
-
-        calculator = sphericart.SphericalHarmonics(degree)
-
-        def value_and_gradient(d, w):
-            y, dy = calculator.compute_with_gradients(np.asarray(d))
-            return np.vdot(y, w), np.einsum("pin,pn->pi", dy, w)
-
-        return "sphericart", lambda d: calculator.compute(np.asarray(d)), value_and_gradient
-
-
-def bench_basis(degrees=(4, 8, 16, 32, 64, 100)):
-    """sh_basis [10,000 points, coefficients last] in float32: time relative to sphericart, error, first call."""
-    d = unit(np.random.default_rng(0).normal(size=(POINTS, 3))).astype(np.float32)
-    rows = []
-    for degree in degrees:
-        peer, values, gradients = competitor(degree)
-        basis = jax.jit(lambda d, degree=degree: harmonics.sh_basis(d, degree))
-        truth = scipy_basis(d[:500].astype(float), degree)
-        signs = np.where(_tables.orders(degree) % 2, -1, 1)  # sphericart: no Condon-Shortley phase
-        times = interleaved({"ours": basis, "peer": values}, jnp.asarray(d))
-        row = {
-            "degree": degree,
-            "peer": peer,
-            "us/point": times["ours"].median / POINTS * 1e6,
-            "speed / peer": times["peer"].median / times["ours"].median,
-            "max error": float(np.max(np.abs(basis(d)[:500] - truth))),
-            "peer's max error": float(np.max(np.abs(np.asarray(values(jnp.asarray(d)))[:500] * signs - truth))),
-            "first call s": times["ours"].first,
-        }
-        if degree <= 32:
-            w = jnp.asarray(np.random.default_rng(1).normal(size=(POINTS, (degree + 1) ** 2)), jnp.float32)
-            ours = jax.jit(jax.value_and_grad(lambda d, w, degree=degree: jnp.vdot(harmonics.sh_basis(d, degree), w)))
-            times = interleaved({"ours": ours, "peer": gradients}, jnp.asarray(d), w)
-            row["with gradient / peer"] = times["peer"].median / times["ours"].median
-        rows.append(row)
-    return rows
-
-
-def bench_evaluate(degrees=(16, 32, 64)):
-    """evaluate: one expansion at 10,000 points in float32, against sphericart and a product."""
-    rng = np.random.default_rng(0)
-    d = unit(rng.normal(size=(POINTS, 3))).astype(np.float32)
-    rows = []
-    for degree in degrees:
-        c = rng.normal(size=(degree + 1) ** 2).astype(np.float32)
-        peer, values, _ = competitor(degree)
-        product = (
-            jax.jit(lambda d, values=values, c=c: values(d) @ c)
-            if peer == "sphericart-jax"
-            else lambda d, values=values, c=c: values(d) @ c
-        )
-        ours = jax.jit(lambda d, c=c: harmonics.evaluate(c, d))
-        times = interleaved({"ours": ours, "peer": product}, jnp.asarray(d))
-        truth = scipy_basis(d[:500].astype(float), degree) @ c.astype(float)
-        rows.append({
-            "degree": degree,
-            "us/point": times["ours"].median / POINTS * 1e6,
-            f"speed / {peer} and product": times["peer"].median / times["ours"].median,
-            "max error / rms": float(np.max(np.abs(ours(d)[:500] - truth)) / np.sqrt(np.mean(truth**2))),
-            "first call s": times["ours"].first,
-        })  # fmt: skip
-    return rows
-
-
-def bench_project_map(degrees=(16, 64, 128)):
-    """project_map of a 512 x 1024 map in float64, against ducc0 with two threads."""
-    import ducc0
-
-    rows = []
-    with jax.enable_x64(True):
-        for degree in degrees:
-            c = np.random.default_rng(0).normal(size=(degree + 1) ** 2)
-            texels = harmonics.synthesize_map(jnp.asarray(c), 512)
-            host = np.asarray(texels)
-            peer = lambda t, degree=degree, host=host: ducc0.sht.experimental.analysis_2d(
-                map=host[None], spin=0, lmax=degree, mmax=degree, geometry="F1", nthreads=2
-            )
-            ours = lambda t, degree=degree: harmonics.project_map(t, degree)
-            times = interleaved({"ours": ours, "peer": peer}, texels)
-            rows.append({
-                "degree": degree,
-                "ms": times["ours"].median * 1e3,
-                "time / ducc0": times["ours"].median / times["peer"].median,
-                "max error / largest": float(np.max(np.abs(np.asarray(ours(texels)) - c)) / np.max(np.abs(c))),
-                "first call s": times["ours"].first,
-            })  # fmt: skip
-    return rows
 
 
 def bench_equation_22(degrees=(4, 8, 16, 30)):
@@ -292,30 +188,6 @@ def bench_moments(degrees=(4, 8, 12, 16, 20, 30, 40, 60, 100)):
     return rows
 
 
-def bench_coefficients(degrees=(8, 20, 40)):
-    """All integrals of the basis over a quad of 0.5 rad, float32: zonal moments about axes, or lines without axes."""
-    rng = np.random.default_rng(0)
-    quads = polygons.spherical_polygons(rng, 4096, 4, 0.5).astype(np.float32)
-    tiles = jnp.asarray(quads.reshape(-1, 64, 4, 3).transpose(0, 3, 2, 1))
-    rows = []
-    for degree in degrees:
-        zonal = lambda v, degree=degree: loop_coefficients(v, loop_solid_angle(v, 2 * np.pi), degree).T
-        routes = {"zonal": zonal, "lines": lambda v, degree=degree: polygons.line_coefficients(v, degree)}
-        routes = {name: jax.jit(lambda v, f=f: jax.lax.map(f, v)) for name, f in routes.items()}
-        times = interleaved(routes, tiles)
-        points = [triangle_rule(q, 24) for q in quads[:4]]
-        truth = np.stack([area.astype(float) @ scipy_basis(w.astype(float), degree) for w, area in points])
-        error = lambda got, t=truth: float(np.max(np.abs(got[0, :4, 1:] - t[:, 1:]) / t[:, :1]) / np.sqrt(4 * np.pi))
-        rows.append({
-            "degree": degree,
-            "us/quad": times["zonal"].median / len(quads) * 1e6,
-            "time of lines / zonal": times["lines"].median / times["zonal"].median,
-            "error / solid angle": error(np.asarray(routes["zonal"](tiles))),
-            "of lines": error(np.asarray(routes["lines"](tiles))),
-        })  # fmt: skip
-    return rows
-
-
 POLYGON_LIGHT = np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]], np.float32)
 
 
@@ -326,51 +198,6 @@ def polygon_light_points(count):
     view = unit(rng.normal(size=(count, 3)) * [1, 1, 0.5] + [0, 0, 1.2]).astype(np.float32)
     view[:, 2] = np.abs(view[:, 2])
     return position, view, np.broadcast_to(np.array([0, 0, 1], np.float32), view.shape)
-
-
-def bench_polygon_light(count=4096):
-    """Radiance from a quad above a floor, float32: lobes over the quad, Monte Carlo, linearly transformed cosines."""
-    position, view, normal = polygon_light_points(count)
-    quad = POLYGON_LIGHT
-    local = jnp.asarray(quad[None] - position[:, None])
-    rows = []
-    for name, make in {
-        "Lambertian": lambda: models.Lambertian(0.8),
-        "GGX 0.5": lambda: models.Ggx(0.5, 0.04),
-        "GGX 0.25": lambda: models.Ggx(0.25, 0.04),
-    }.items():
-        with jax.enable_x64(True):
-            few = [np.asarray(x[:256], float) for x in (position, normal, view)]
-            truth = np.asarray(reference.shade_polygon_quadrature(make(), quad.astype(float), 1.0, *few, nodes=48))
-        brdf, key = make(), jax.random.key(0)
-        methods = {}
-        for degree in (4, 8, 20):
-            basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-            lobes = shading.tabulate_brdf(brdf, basis, domain="upper")
-            shade = lambda p, v, lobes=lobes: shading.shade_polygon(lobes, models.PolygonLight(quad), p, normal, v)
-            methods[f"lobes, degree {degree}"] = shade
-        for samples in (16, 256):
-            for kind, estimate in (
-                ("area", polygons.monte_carlo_area),
-                ("solid angle", polygons.monte_carlo_solid_angle),
-            ):
-                methods[f"{samples} samples by {kind}"] = lambda p, v, e=estimate, n=samples, b=brdf, k=key: (
-                    e(b, local, v, key=k, samples=n).value
-                )
-        transformed = polygons.fit_ltc(brdf)
-        methods["transformed cosines"] = lambda p, v, t=transformed: polygons.ltc_radiance(t, local, v)
-        times = interleaved(methods, jnp.asarray(position), jnp.asarray(view))
-        for method, shade in methods.items():
-            error = np.asarray(shade(jnp.asarray(position), jnp.asarray(view)))[:256] - truth
-            rows.append({
-                "material": name,
-                "method": method,
-                "us/pixel": times[method].median / count * 1e6,
-                "relative RMSE": float(np.sqrt(np.mean(error**2) / np.mean(truth**2))),
-                "max error / max": float(np.max(np.abs(error)) / np.max(truth)),
-                "first call s": times[method].first,
-            })  # fmt: skip
-    return rows
 
 
 def bench_ridge(ridges=(1e-2, 1e-4, 1e-6, 1e-8, 1e-10), degree=8, count=64):
@@ -421,16 +248,11 @@ def cost_figure(rows, path):
 
 
 BENCHES = {
-    "basis": bench_basis,
-    "evaluate": bench_evaluate,
-    "project_map": bench_project_map,
     "equation_22": bench_equation_22,
     "memory": bench_memory,
     "moments": bench_moments,
     "polygons": bench_polygons,
     "polygon_degree": bench_polygon_degree,
-    "coefficients": bench_coefficients,
-    "polygon_light": bench_polygon_light,
     "ridge": bench_ridge,
     "directions": conditioning.bench_directions,
     "objectives": conditioning.bench_objectives,

@@ -1,0 +1,108 @@
+"""How far the fast paths are from what this machine can do: counted work over measured speeds of its kinds.
+
+Three speeds, float32, all cores: products of matrices of the shapes that the paths use, one tile after another;
+elementwise arithmetic in registers (a long polynomial of a short array); copies of large arrays. The bound of a path is
+the time that its products, its arithmetic and the bytes that it must read and write take at these speeds, one after the
+other, with nothing counted for frames, splines, clipping, square roots or loops.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shisd import decomposition, harmonics, models, shading
+from shisd.domains._integrate import incidence_inverse
+from shisd.harmonics import _pairing
+from tests.bench import local_lights
+from tests.bench.timing import interleaved
+
+COUNT, VIEWS = 16384, 64
+COLUMNS = VIEWS + 4  # of the spline in the elevation of the view
+
+
+def speeds() -> dict[str, float]:
+    """Products and operations in 1e9/s, bytes in GB/s."""
+    rng = np.random.default_rng(0)
+    array = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
+    matrix, tiles, long, big = array(208, COLUMNS), array(16, COLUMNS, 1024), array(1 << 14), array(1 << 25)
+    steps, repeats = 512, 16
+
+    def polynomial(x):
+        """Two chains at a time, as operations wait for each other."""
+        y, z = x, x
+        for _ in range(steps // 2):
+            y, z = 0.5 * y + x, 0.25 * z + x
+        return y + z
+
+    functions = {
+        "products": lambda: jax.lax.map(lambda x: matrix @ x, tiles),
+        "operations": lambda: jax.lax.fori_loop(0, repeats, lambda _, x: polynomial(x), long),
+        "bytes": lambda: big + 1,
+    }
+    times = interleaved({name: jax.jit(f) for name, f in functions.items()}, seconds=0.5)
+    work = {
+        "products": matrix.shape[0] * tiles.size,
+        "operations": 2 * steps * repeats * long.size,
+        "bytes": 2 * big.nbytes,
+    }
+    return {name: work[name] / times[name].best / 1e9 for name in work}
+
+
+def environment_work(degree: int, colours: int) -> dict[str, float]:
+    """Of `shade_environment` for a pixel: spline, view azimuth, exchange of axes, series of the light."""
+    rows = len(_pairing.rows(degree)[0])
+    exchange = sum(m.size for block in _pairing._blocks(degree) for m in block.swap)
+    series = sum(m.size for m in _pairing.turned_series(jnp.zeros((3, (degree + 1) ** 2)), degree))
+    return {"products": colours * (rows * COLUMNS + exchange) + 2 * rows * (degree + 1) + series}
+
+
+def polygon_work(degree: int, edges: int) -> dict[str, float]:
+    """Of `shade_polygon` for a pixel: spline, weights of the axes, and the recurrences along edges."""
+    rows = (degree + 1) * (degree + 2) // 2
+    weights = sum(m.size for m in incidence_inverse(degree, np.dtype("float32"))[1])
+    steps = (degree + 1) * (degree - 1)
+    return {"products": rows * COLUMNS + weights, "operations": steps * (18 * edges + 7)}
+
+
+def tables(quick: bool) -> dict[str, list[dict]]:
+    peak = speeds()
+    rows = []
+    positions, normals, views = local_lights.points("wall")
+    facing = np.sum(normals * views, axis=1, keepdims=True)
+    views = np.where(facing > 0, views, views - 2 * facing * normals)
+    light = models.PolygonLight(local_lights.QUADS["wall"])
+    for degree in (8,) if quick else (8, 16, 30):
+        basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+        e = jnp.asarray(np.random.default_rng(1).normal(size=(3, (degree + 1) ** 2)), jnp.float32)
+        fitted = shading.tabulate_brdf(models.Ggx(0.25, 0.04), basis, views=VIEWS, domain="upper")
+        one = shading.tabulate_brdf(models.Ggx(0.25, 0.04), basis, views=VIEWS)
+        rgb = shading.tabulate_brdf(models.Ggx(0.25, np.array([0.9, 0.6, 0.3])), basis, views=VIEWS)
+        shade = lambda lobes, e=e: functools.partial(shading.shade_environment, lobes, e, normals, views)
+        functions = {
+            "shade_environment, one colour": (shade(one), environment_work(degree, 1)),
+            "shade_environment, RGB material": (shade(rgb), environment_work(degree, 3)),
+            "shade_polygon, all lamps cut by the horizon": (
+                functools.partial(shading.shade_polygon, fitted, light, positions, normals, views),
+                polygon_work(degree, 6),
+            ),
+            "sh_basis": (
+                functools.partial(harmonics.sh_basis, normals, degree),
+                {"bytes": 4.0 * ((degree + 1) ** 2 + 3)},
+            ),
+        }  # fmt: skip
+        times = interleaved({name: f for name, (f, _) in functions.items()}, seconds=0.5)
+        for name, (_, work) in functions.items():
+            us = times[name].best / COUNT * 1e6
+            bound = sum(amount / peak[kind] for kind, amount in work.items()) * 1e-3
+            rows.append({
+                "path": name,
+                "degree": degree,
+                **{f"{kind} per pixel": f"{work[kind]:,.0f}" if kind in work else "" for kind in peak},
+                "us/pixel": us,
+                "bound, us": bound,
+                "time over bound": us / bound,
+            })  # fmt: skip
+    measured = ", ".join(f"{value:.0f} G{kind}/s" for kind, value in peak.items())
+    return {f"Fast paths against bounds from the speeds of this machine: {measured}.": rows}
