@@ -17,6 +17,7 @@ To add a family: a function of a Scene that returns its methods, listed in FAMIL
 
 import argparse
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -182,7 +183,8 @@ def prefiltered(scene: Scene) -> list[Method]:
     for degree in (30,) if scene.quick or scene.material != "GGX 0.1" else (30, 64):
         lobes, seconds = sharp_table(scene.material, degree)
         light = coefficients(scene.map)[0][:, : (degree + 1) ** 2]
-        for tolerance in scene.some((0.1, 0.03, 0.01, 0.003) if scene.glossy else (0.01,)):
+        tolerances = (0.1, 0.03, 0.01, 0.003) if scene.map == "interior" else (0.03, 0.003)
+        for tolerance in scene.some(tolerances if scene.glossy else (0.01,)):
             make = functools.partial(shading.prefilter, lobes, light, tolerance=tolerance)
             first = make()
             filtered, filtering = timed(make, f"prefilter {degree} {first.maps.shape}")
@@ -330,20 +332,19 @@ def gaussians(scene: Scene) -> list[Method]:
 FAMILIES = (shisd, prefiltered, estimators, fixed_lights, rotations, split_sums, gaussians)
 
 
-def tasks(quick: bool) -> list[Task]:
+def tasks(quick: bool) -> Iterator[Task]:
+    """One after another, as maps and tables of all scenes together take gigabytes."""
     stored = np.load(STORED)
-    made = []
     for material in ("GGX 0.25",) if quick else MATERIALS:
         for name in ("interior",) if quick else MAPS:
             scene, title = Scene(material, name, quick), f"{material}, {name}"
             methods = [method for family in FAMILIES for method in family(scene)]
             if not scene.with_gradients:
                 methods = [replace(method, gradient=None) for method in methods]
-            made.append(
-                Task(f"environment: {title}", title, "pixel", pixels(), stored[title], float(stored[f"{title}: error"]),
-                     methods, count=SIDE**2)
+            yield Task(
+                f"environment: {title}", title, "pixel", pixels(), stored[title], float(stored[f"{title}: error"]),
+                methods, count=SIDE**2,
             )  # fmt: skip
-    return made
 
 
 # --- references
