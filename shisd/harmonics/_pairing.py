@@ -86,7 +86,7 @@ def _diagonals(matrices: np.ndarray) -> Bands:
         i = np.arange(max(0, -offset), min(rows, columns - offset))
         diagonals[offset] = np.zeros((len(matrices), rows))
         diagonals[offset][:, i] = matrices[:, i, i + offset]
-    return {offset: d for offset, d in diagonals.items() if d.any()}
+    return {offset: d for offset, d in diagonals.items() if d.any()} or {0: diagonals[0]}
 
 
 def _generators(degree: int) -> list[list[np.ndarray]]:
@@ -242,8 +242,9 @@ def _product(matrices: tuple[np.ndarray, ...], parts: Parts) -> Parts:
 
 
 def _neighbours(diagonals: tuple[Bands, ...], parts: Parts) -> Parts:
+    product = lambda x, offset, d: jnp.asarray(d[:, :, None, None], x.dtype) * _shifted(x, offset, d.shape[1])
     return tuple(
-        sum(jnp.asarray(d[:, :, None, None], x.dtype) * _shifted(x, offset, d.shape[1]) for offset, d in bands.items())
+        functools.reduce(jnp.add, [product(x, offset, d) for offset, d in bands.items()])
         for bands, x in zip(diagonals, parts, strict=True)
     )
 
