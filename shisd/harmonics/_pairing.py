@@ -146,7 +146,8 @@ def _pair_many_jvp(degree, upright, primals, tangents):
             turning = _turning(lobe, [-w for w in rates(r, dr)], degree)
             moved = [tuple(p + q for p, q in zip(s, t, strict=True)) for s, t in zip(moved, turning, strict=True)]
         change += _pair_away_from_pole(moved, series, r, degree)
-    if not any(isinstance(t, SymbolicZero) for t in d_series):
+    if not all(isinstance(t, SymbolicZero) for t in d_series):
+        d_series = tuple(zero(d, m) for d, m in zip(d_series, series, strict=True))
         change += _pair_away_from_pole(lobe, d_series, r, degree)
     return value, change
 
@@ -158,19 +159,15 @@ def _pair_away_from_pole(s: list[Parts], series: Series, r: Float[Array, "p 3 3"
     """`pair_many` with smooth angles: where R nearly keeps the z axis, s . R c = Q s . Q R c with Q, a quarter turn."""
     near = r[:, 2, 2] ** 2 > 1 - _NEAR**2
 
-    def away() -> tuple[list[Parts], Waves, Waves]:
-        a, b, g = turns(jnp.where(near[:, None, None], jnp.asarray(QUARTER, r.dtype) @ r, r), max(degree, 1))
-        here = near[None, None, None]
+    def away() -> tuple[list[Parts], Array]:
         turned = [(xa, -ya, xb, -yb) for xa, ya, xb, yb in _swapped(s, degree)]
-        t = [tuple(jnp.where(here, q, p) for p, q in zip(*both, strict=True)) for both in zip(s, turned, strict=True)]
-        return _turned(t, a[0], -a[1], degree), b, g
+        pick = lambda q, p: jnp.where(near[None, None, None], q, p)
+        parts = [tuple(pick(q, p) for p, q in zip(*both, strict=True)) for both in zip(s, turned, strict=True)]
+        return parts, jnp.where(near[:, None, None], jnp.asarray(QUARTER, r.dtype) @ r, r)
 
-    def as_it_is() -> tuple[list[Parts], Waves, Waves]:
-        a, b, g = turns(r, max(degree, 1))
-        return _turned(s, a[0], -a[1], degree), b, g  # where a = 0, its derivative is not
-
-    s, b, g = jax.lax.cond(jnp.any(near), away, as_it_is)
-    return _pair(s, series, None, b, g, degree)
+    s, r = jax.lax.cond(jnp.any(near), away, lambda: (s, r))
+    a, b, g = turns(r, max(degree, 1))
+    return _pair(s, series, a, b, g, degree)  # of upright rotations a = 0, but its derivative is not
 
 
 def _pair(s: list[Parts], series: Series, a: Waves | None, b: Waves, g: Waves, degree: int) -> Float[Array, "f3 p"]:

@@ -11,13 +11,11 @@ rows of the slice, of which c_m / s is smooth for m > 0; u = an outline in the f
 """
 
 import functools
-import math
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from shisd._numerics import safe_sqrt
 from shisd._typing import Array, Float
 from shisd.domains._integrate import fold_expansion, incidence_inverse
 from shisd.domains._moments import Loop
@@ -37,22 +35,22 @@ def incidence_integrals(
 
     Derivatives: the first exact for every view, along the normal too; those in the view along the sphere.
     """
-    return _fold(_slices(table, _views.elevation(view), degree), _turned(u, *_azimuth(view)), spare)
+    return _fold(_slices(table, _views.elevation(view), degree), _turned(u, *_views.azimuth(view)), degree, spare)
 
 
 def _incidence_integrals_jvp(degree, spare, primals, tangents):
     (table, view, u), (d_table, d_view, du) = primals, tangents
     value = incidence_integrals(table, view, u, degree, spare)
-    theta, (cos, sin) = _views.elevation(view), _azimuth(view)
+    theta, (cos, sin) = _views.elevation(view), _views.azimuth(view)
     v, change, dv, across = _turned(u, cos, sin), jnp.zeros_like(value), jnp.zeros_like(u), None
     if not isinstance(d_table, SymbolicZero):
-        in_table = lambda t: _fold(_slices(t, theta, degree), v, spare)
+        in_table = lambda t: _fold(_slices(t, theta, degree), v, degree, spare)
         change += jax.jvp(in_table, (table,), (d_table,))[1]
     if not isinstance(d_view, SymbolicZero):
         dx, dy, dz = d_view.T
         along, across = cos * dx + sin * dy, cos * dy - sin * dx
         _, steeper = jax.jvp(lambda t: _slices(table, t, degree), (theta,), (jnp.ones_like(theta),))
-        change += _fold(steeper, v, spare) * (view[:, 2] * along - jnp.sin(theta) * dz)
+        change += _fold(steeper, v, degree, spare) * (view[:, 2] * along - jnp.sin(theta) * dz)
     if not isinstance(du, SymbolicZero):
         dv += _turned(du, cos, sin)
     if not (isinstance(du, SymbolicZero) and across is None):
@@ -70,7 +68,7 @@ def _outline_moves(
 
     def moves(by: Loop, over_sine: bool) -> Array:
         rows = _slices(table, theta, degree, over_sine=over_sine)
-        return jax.jvp(lambda v: _fold(rows, v, spare), (v,), (by,))[1]
+        return jax.jvp(lambda v: _fold(rows, v, degree, spare), (v,), (by,))[1]
 
     if across is None:
         return moves(dv, False)
@@ -78,8 +76,7 @@ def _outline_moves(
     back, sine = jnp.stack([v[1], -v[0], jnp.zeros_like(v[0])]) * across[None, None], jnp.sin(theta)
     steep = sine < _STEEP
     dv += back * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]
-    back *= jnp.where(steep, 1, 0)[None, None].astype(back.dtype)
-    none, at_normal = lambda: jnp.zeros_like(theta), lambda: moves(back, True)
+    none, at_normal = lambda: jnp.zeros_like(theta), lambda: moves(jnp.where(steep[None, None], back, 0), True)
     return moves(dv, False) + jax.lax.cond(jnp.any(steep), at_normal, none)
 
 
@@ -91,16 +88,8 @@ def _slices(table: Array, theta: Array, degree: int, *, over_sine: bool = False)
     return rows * jnp.where(m[m >= 0][:, None] > 0, scale[1], scale[0])
 
 
-def _fold(rows: Float[Array, "rows p"], v: Loop, spare: int) -> Float[Array, " p"]:
-    degree = (math.isqrt(8 * len(rows) + 1) - 3) // 2  # rows are (L+1)(L+2)/2
+def _fold(rows: Float[Array, "rows p"], v: Loop, degree: int, spare: int) -> Float[Array, " p"]:
     return fold_expansion(rows, v, *incidence_inverse(degree, rows.dtype), spare)
-
-
-def _azimuth(view: Float[Array, "p 3"]) -> tuple[Array, Array]:
-    sine = safe_sqrt(view[:, 0] ** 2 + view[:, 1] ** 2)
-    off = sine > 0
-    safe = jnp.where(off, sine, 1)
-    return jnp.where(off, view[:, 0] / safe, 1), view[:, 1] / safe
 
 
 def _turned(u: Loop, cos: Array, sin: Array) -> Loop:

@@ -101,7 +101,7 @@ def lookup_table(lobes: Lobes, degree: int | None = None) -> Float[Array, "*colo
 
 def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p 3"], lobes: Lobes) -> Array:
     """Interpolated SH coefficients of the slices, in the local frame: [*colour, n, p]."""
-    c = table @ _lookup_factors(view, lobes)
+    c = table @ lookup_factors(view, lobes)
     if not lobes.isotropic:
         return c
     # the table holds the slice of azimuth 0; turned by phi, m mixes with -m
@@ -126,7 +126,7 @@ def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], t
         return (flat @ factors).reshape(*table.shape[:2], -1)
 
     def look_up(view: Float[Array, "p 3"]) -> tuple[Array, Array]:
-        factors = _lookup_factors(view, lobes)
+        factors = lookup_factors(view, lobes)
         x = product(plus, factors)
         if not lobes.isotropic:
             return x, product(minus, factors)
@@ -137,7 +137,7 @@ def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], t
     return look_up
 
 
-def _lookup_factors(view: Float[Array, "p 3"], lobes: Lobes) -> Float[Array, "columns p"]:
+def lookup_factors(view: Float[Array, "p 3"], lobes: Lobes) -> Float[Array, "columns p"]:
     """What the columns of `lookup_table` are multiplied by."""
     if lobes.isotropic:
         return _views.spline_weights(_views.elevation(view), lobes.weights.shape[-3])

@@ -31,9 +31,8 @@ from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models._light import lobe_product
-from shisd.shading import _views
 from shisd.shading._incidence import incidence_integrals
-from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
+from shisd.shading._lobes import Lobes, check_lobes, lookup_factors, lookup_table, slice_values
 from shisd.shading._surface import in_tiles, shade_points, shade_tiles, surface
 
 Light = PolygonLight | PortalLight
@@ -153,7 +152,7 @@ def _shade(
             relative = light.points.T[:, :, None] - positions.T[:, None]
             above = dot(frame[:, :, 2].T[:, None], relative)
             sign = jnp.where(jnp.max(above, axis=0) > 0, _facing(light, relative), 0)
-            outline = _local(frame, relative)
+            outline = _in_frame(frame, relative)
             if product is None:
                 lit = times(_uniform(lobes, table, local, outline, above, sign), _constant_radiance(light))
             else:
@@ -176,8 +175,7 @@ def _uniform(lobes: Lobes, table: Array, local: Array, outline: Loop, above: Arr
         v = on_sphere(jax.lax.cond(all_whole, whole, lambda: clip(outline, above)))
         angle = loop_solid_angle(v, 2 * np.pi, _up(v))
         if lobes.isotropic:
-            splines = _views.spline_weights(_views.elevation(local), table.shape[-1] - 4)
-            constant, tables = table[..., 0, :] @ splines, table.reshape(-1, *table.shape[-2:])
+            constant, tables = table[..., 0, :] @ lookup_factors(local, lobes), table.reshape(-1, *table.shape[-2:])
             rest = [incidence_integrals(t, local, v, lobes.degree, spare) for t in tables]
         else:
             c = slice_values(table, local, lobes)
@@ -194,9 +192,10 @@ def _directional(
 ) -> Float[Array, "*colour p"]:
     """Integrals of slices times the light's radiance, over its outline above the horizon."""
     c, v = slice_values(table, local, lobes), on_sphere(clip(outline, outline[2]))
-    world = jnp.einsum("pij,jsp->isp", frame, v)
+    to_local = jnp.swapaxes(frame, 1, 2)
+    world = _in_frame(to_local, v)
     seen = _through(product, world, loop_solid_angle(v, 2 * np.pi, _up(v))).reshape(-1, c.shape[-2], v.shape[2])
-    seen = rotate_many(jnp.moveaxis(seen, 0, 1), jnp.swapaxes(frame, 1, 2), lobes.degree, lobes.isotropic)
+    seen = rotate_many(jnp.moveaxis(seen, 0, 1), to_local, lobes.degree, lobes.isotropic)
     seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *c.shape[-2:])
     return jnp.sum(times(c, seen), axis=-2)
 
@@ -239,10 +238,9 @@ def _up(v: Loop) -> Float[Array, "3 p"]:
     return jnp.broadcast_to(jnp.asarray([0, 0, 1], v.dtype)[:, None], (3, v.shape[2]))
 
 
-def _local(frame: Float[Array, "p 3 3"], relative: Loop) -> Loop:
-    """frame^T relative, written out: XLA has no fast code for many small products."""
-    r = jnp.moveaxis(frame, 0, -1)
-    return jnp.stack([sum(r[i, j][None] * relative[i] for i in range(3)) for j in range(3)])
+def _in_frame(frame: Float[Array, "p 3 3"], v: Loop) -> Loop:
+    """frame^T v, written out: XLA has no fast code for many small products."""
+    return jnp.stack([dot(axis[:, None], v) for axis in jnp.moveaxis(frame, 0, -1).swapaxes(0, 1)])
 
 
 def incident_radiance(light: Light) -> Float[Array, "*colour_n"]:

@@ -85,7 +85,7 @@ def _to_nodes(theta: Float[Array, " p"], count: int) -> Float[Array, "coefs p"]:
 def azimuth_factors(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array, "k p"], Float[Array, "k p"]]:
     """sin(theta) cos(k phi) and sin(theta) sin(k phi) for k = 1 ... count-1, after 1 and 0 for k = 0."""
     x, y = view[None, :, 0], view[None, :, 1]
-    cos, sin = _azimuth_multiples(view, max(count - 1, 1))
+    cos, sin = angle_multiples(*azimuth(view), max(count - 1, 1))
     real = jnp.concatenate([jnp.ones_like(x), x * cos - y * sin])  # (x, y) = sin(theta) (cos, sin)(phi)
     return real[:count], jnp.concatenate([jnp.zeros_like(x), x * sin + y * cos])[:count]
 
@@ -93,7 +93,7 @@ def azimuth_factors(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array,
 @azimuth_factors.defjvp
 def _azimuth_factors_jvp(count, primals, tangents):
     (view,), (d_view,) = primals, tangents
-    cos, sin = _azimuth_multiples(view, max(count, 2))
+    cos, sin = angle_multiples(*azimuth(view), max(count, 2))
     dx, dy = d_view[:, 0], d_view[:, 1]
     k = np.arange(count)
     along = rows_of(cos[1] * dx + sin[1] * dy, np.minimum(k, 1))  # d sin(theta)
@@ -102,12 +102,12 @@ def _azimuth_factors_jvp(count, primals, tangents):
     return azimuth_factors(view, count), (cos * along - sin * across, sin * along + cos * across)
 
 
-def _azimuth_multiples(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array, "k p"], Float[Array, "k p"]]:
-    """cos(k phi) and sin(k phi), with phi = 0 at the normal."""
+def azimuth(view: Float[Array, "p 3"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """cos(phi) and sin(phi), with phi = 0 at the normal."""
     sine = _sine(view)
     off = sine > 0
     safe = jnp.where(off, sine, 1)
-    return angle_multiples(jnp.where(off, view[:, 0] / safe, 1), view[:, 1] / safe, count)
+    return jnp.where(off, view[:, 0] / safe, 1), view[:, 1] / safe
 
 
 def _sine(view: Float[Array, "p 3"]) -> Float[Array, " p"]:

@@ -10,6 +10,7 @@ from shisd import domains
 from shisd.domains import _moments
 from tests import truth
 from tests.hard_cases import POLYGONS, axes_for, padded, random_polygon, unit
+from tests.marks import FLOAT32_FIRST
 
 
 def solid_angle(vertices):
@@ -155,7 +156,7 @@ def test_powers_differentiate(x64, rng):
     )
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
+@FLOAT32_FIRST
 def test_high_degree_and_fold_agree(dtype, rng):
     """The loop and the unrolled sweep of the fused sum, against the moments."""
     v = jnp.asarray(np.stack([random_polygon(rng, 4, s) for s in (1.0, 0.01)]).transpose(2, 1, 0), dtype)

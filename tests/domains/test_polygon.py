@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 from shisd import domains
 from tests import truth
 from tests.hard_cases import POLYGONS, SLOTS, padded, random_polygon, ring, unit
+from tests.marks import FLOAT64_FIRST
 
 
 def area(vertices, **options):
@@ -45,7 +46,7 @@ def test_gradient_of_the_solid_angle(x64, rng):
     check_grads(f, (padded(random_polygon(rng, 5, 1.0)),), order=2, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)], indirect=True)
+@FLOAT64_FIRST
 @pytest.mark.parametrize("name", ["non-convex", "clockwise", "near a hemisphere", "collinear vertices"])
 def test_clipping_keeps_what_is_above(name, dtype, rng):
     """Moments of the part above and of the part below add up, and the solid angle above is the quadrature's."""
@@ -64,7 +65,7 @@ def test_clipping_keeps_what_is_above(name, dtype, rng):
         assert abs(float(domains.solid_angle(above)) - expected) < 1e-2
 
 
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)], indirect=True)
+@FLOAT64_FIRST
 def test_clipping_at_the_limits(dtype):
     v = random_polygon(np.random.default_rng(1), 4, 0.5).astype(dtype)
     polygon, up = domains.SphericalPolygon(v), unit(v.sum(axis=0)).astype(dtype)

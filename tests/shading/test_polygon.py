@@ -12,6 +12,7 @@ from jax.test_util import check_grads
 from shisd import decomposition, domains, models, reference, shading
 from tests import truth
 from tests.hard_cases import unit
+from tests.marks import FLOAT32_FIRST
 
 QUAD = np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]])  # emits downwards
 BRDFS = {
@@ -132,7 +133,7 @@ def test_hard_cases(name, dtype):
         np.testing.assert_allclose(gradient(points), gradient(points + lift), atol=2e-5 * scale)
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
+@FLOAT32_FIRST
 def test_light_by_direction(dtype, rng):
     """A profile at the light, and distant light through the same outline; in front, and from behind nothing."""
     position, normal, view = scene(rng, 6)
@@ -167,7 +168,7 @@ def test_a_uniform_profile_and_several_portals(rng):
     np.testing.assert_allclose(got, 2 * plain, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
+@FLOAT32_FIRST
 def test_projected_light(dtype, rng):
     """Coefficients of what a light sends to a point, against quadrature; several points and colours."""
     position = scene(rng, 4)[0].astype(dtype)

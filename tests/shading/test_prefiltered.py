@@ -9,6 +9,7 @@ import pytest
 from jax.test_util import check_grads
 
 from shisd import decomposition, models, shading
+from tests.marks import FLOAT32_FIRST
 
 DEGREE = 6
 
@@ -43,7 +44,7 @@ def lobes_of(material, dtype):
     return shading.tabulate_brdf(MATERIALS[material](), decomposition.RotatedZonalBasis(axes, DEGREE), views=32)
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
+@FLOAT32_FIRST
 @pytest.mark.parametrize("material", ["glossy", pytest.param("diffuse", marks=pytest.mark.slow)])
 def test_error_is_as_predicted(material, dtype, rng):
     lobes, e = lobes_of(material, dtype), light(rng).astype(dtype)

@@ -8,6 +8,7 @@ from jax.test_util import check_grads
 
 from shisd import decomposition, harmonics, models, shading
 from tests.hard_cases import unit
+from tests.marks import FLOAT32_FIRST
 
 DEGREE = 5
 MATERIALS = {"glossy": models.Ggx(0.4, 0.3), "brushed": models.Ggx(np.float32([0.3, 0.6]), np.float32([0.9, 0.6, 0.3]))}
@@ -25,7 +26,7 @@ def scene(rng, count, dtype):
     return tuple(a.astype(dtype) for a in (axis, z, normals, views, tangents))
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
+@FLOAT32_FIRST
 @pytest.mark.parametrize(
     "material", ["glossy", *(pytest.param(m, marks=pytest.mark.slow) for m in MATERIALS if m != "glossy")]
 )
