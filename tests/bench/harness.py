@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from tests.bench import timing
 from tests.bench.timing import interleaved
 
 HISTOGRAM = np.array([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, np.inf])  # of |error| over the RMS of the reference
@@ -191,6 +192,18 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
 # ---- compiling and timing
 
 _compiled: dict = {}
+
+
+def make_room(most: int = 30000) -> None:
+    """Forget compiled programs if the process holds more than `most` memory maps (Linux).
+
+    A program takes some 20 to 100, and where the system's 65,530 are used up, compiling fails for lack of memory.
+    """
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_text().count("\n") > most:
+        _compiled.clear()
+        timing.forget()
+        jax.clear_caches()
 
 
 def _compile(function: Callable, arguments: tuple, host: bool) -> _Compiled:

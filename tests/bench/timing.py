@@ -38,7 +38,12 @@ def _time(method: Callable, arguments: tuple) -> float:
     return time.perf_counter() - start
 
 
-_seen: set[Hashable] = set()
+_seen: set[Hashable] = set()  # kinds that are compiled
+
+
+def forget() -> None:
+    """Every kind counts as new again, as when compiled programs are gone."""
+    _seen.clear()
 
 
 def timed(function: Callable, kind: Hashable = None):
