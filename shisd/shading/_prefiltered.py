@@ -32,7 +32,6 @@ from shisd._numerics import normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import _tables, rotate
-from shisd.harmonics._rotation import rotate_many
 from shisd.shading import _views
 from shisd.shading._lobes import Lobes, check_lobes
 from shisd.shading._surface import in_tiles, shade_points
@@ -78,7 +77,7 @@ def prefilter(
     right within a factor of 2 on photographed maps.
     Channels are chosen from values, so not under jit, grad or vmap. There pass `like`, an earlier result: its channels
     are used again and only the tables are made, a pure function of `lobes` and `light_coefficients`, linear in each.
-    Cost: the light is turned to 18 (L+1)^2 frames for each of two charts. The maps hold about as many texels in all.
+    Cost: the maps hold 18 (L+1)^2 texels; each is a Fourier series, summed over rows, then over columns.
     Source: ISD15 Eq. 22, whose zonal maps this extends to orders m > 0.
     """
     check_lobes(lobes, everywhere=True)
@@ -103,7 +102,7 @@ def prefilter(
     elif not isinstance(like, PrefilteredLobes) or like.degree != degree:
         raise ValueError(f"`like` must come from shading.prefilter at degree {degree}.")
     like = jax.lax.stop_gradient(_as_type(like, dtype))
-    profiles, maps = _filter(c, e.reshape(-1, e.shape[-1]), like)
+    profiles, maps = _filter(c, e.reshape(-1, e.shape[-1]), like, jnp.asarray(_swaps(degree), dtype))
     return dataclasses.replace(like, profiles=profiles, maps=maps, colours=(lobes.colour, e.shape[:-1]))
 
 
@@ -147,9 +146,11 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
     energy = np.array([np.mean(np.sum(e[:, k * k : (k + 1) ** 2] ** 2, axis=1)) for k in l]) / (2 * l + 1)
     theta = _views.elevations(c.shape[1])
     share = np.sqrt(np.sin(2 * theta) / np.sum(np.sin(2 * theta)))
+    swaps, slices = jnp.asarray(_swaps(degree), float), jnp.asarray(c, float)
     found = []
     for mirror in (False, True):
-        orders, *rest = _channels(np.asarray(_centred(jnp.asarray(c), mirror)) * share, np.sqrt(energy), tolerance)
+        centred = np.asarray(_centred(slices, jnp.asarray(mirror), swaps))
+        orders, *rest = _channels(centred * share, np.sqrt(energy), tolerance)
         found.append((len(orders) + np.count_nonzero(orders), mirror, orders, *rest))
     _, mirror, m, error, reduce, expand = min(found, key=lambda x: x[0])
     turning = np.flatnonzero(m > 0)  # these have a V
@@ -164,13 +165,11 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
 
 
 def _channels(c: np.ndarray, weight: np.ndarray, tolerance: float):
-    """The leading singular vectors over bands of all orders together; c [n, colours, V], weight [L+1]."""
+    """The leading singular vectors over bands of all orders together; c [l, m, colours, V], weight [L+1]."""
     degree = len(weight) - 1
-    m = _tables.orders(degree)
     vectors, values, orders = [], [], []
     for order in range(degree + 1):
-        rows = np.zeros((degree + 1, c[0].size))
-        rows[order:] = c[m == order].reshape(degree + 1 - order, -1) * weight[order:, None]
+        rows = c[:, degree + order].reshape(degree + 1, -1) * weight[:, None]
         u, s, _ = np.linalg.svd(rows, full_matrices=False)
         vectors.append(u.T[: degree + 1 - order])
         values.append(s[: degree + 1 - order])
@@ -186,35 +185,72 @@ def _channels(c: np.ndarray, weight: np.ndarray, tolerance: float):
     return orders[kept], error, vectors[kept] * weight, expand
 
 
-def _centred(c: Float[Array, "s v n"], mirror: bool | Array) -> Float[Array, "n s v"]:
+@eqx.filter_jit
+def _centred(c: Float[Array, "s v n"], mirror: bool | Array, swaps: Float[Array, "l m m"]) -> Float[Array, "l m s v"]:
     """Coefficients of slices in frames whose z axis is the centre, and whose x axis points to the normal's side."""
-    theta = _views.elevations(c.shape[1])
-    cos, sin, zero, one = np.cos(theta), np.sin(theta), 0 * theta, 0 * theta + 1
-    turn = np.stack([[cos, zero, sin], [zero, one, zero], [-sin, zero, cos]]).transpose(2, 0, 1)  # rows: x, y, z
-    turn = jnp.where(mirror, jnp.asarray(turn, c.dtype), jnp.eye(3, dtype=c.dtype)[None])
-    return rotate_many(jnp.moveaxis(c, -1, 0), turn, _checks.degree_of(c.shape[-1]))
+    degree = len(swaps) - 1
+    order = np.arange(-degree, degree + 1)[:, None, None]
+    angle = jnp.where(mirror, jnp.asarray(order * _views.elevations(c.shape[1]), c.dtype), 0)  # [m, 1, v]
+    x = jnp.einsum("lkm,svlm->lksv", swaps, _banded(c))
+    x = jnp.cos(angle)[None] * x + jnp.sin(angle)[None] * x[:, ::-1]  # Ry(theta) is J Z(-theta) J
+    return jnp.einsum("lmk,lksv->lmsv", swaps, x)
+
+
+@functools.cache
+def _swaps(degree: int) -> np.ndarray:
+    """J_l of all bands [l, m, k], zero where |m| or |k| > l."""
+    inner = [slice(degree - l, degree + l + 1) for l in range(degree + 1)]
+    swaps = np.zeros((degree + 1, 2 * degree + 1, 2 * degree + 1))
+    for l, j in enumerate(_tables.swap_matrices(degree)):
+        swaps[l, inner[l], inner[l]] = j
+    return swaps
+
+
+def _banded(c: Float[Array, "*batch n"]) -> Float[Array, "*batch l m"]:
+    """Coefficients by band and order, zero where |m| > l."""
+    degree = _checks.degree_of(c.shape[-1])
+    l, m = np.arange(degree + 1)[:, None], np.arange(-degree, degree + 1)
+    padded = jnp.concatenate([c, jnp.zeros_like(c[..., :1])], axis=-1)
+    return padded[..., np.where(np.abs(m) <= l, l * l + l + m, -1)]
 
 
 # ---- tables
 
 
 @eqx.filter_jit
-def _filter(c: Float[Array, "s v n"], e: Float[Array, "s2 n"], like: PrefilteredLobes) -> tuple[Array, Array]:
+def _filter(
+    c: Float[Array, "s v n"], e: Float[Array, "s2 n"], like: PrefilteredLobes, swaps: Float[Array, "l m m"]
+) -> tuple[Array, Array]:
     """`profiles` and `maps` of `PrefilteredLobes`."""
-    degree = like.degree
     m = jnp.abs(like.order)
-    a = _of_orders(like.reduce, m, degree) @ _centred(c, like.mirror).reshape(c.shape[-1], -1)
-    a = jnp.swapaxes(a.reshape(len(m), *c.shape[:2]), 0, 1)
-    profiles = _views.spline_table(a, m)  # [s, maps, V+4]
-    combine = _of_orders(like.expand, like.order, degree)
-    charts = [e, rotate(e, jnp.asarray(_CHART_X, e.dtype))]
-    maps = jnp.concatenate([_chart(x, combine, like.order, degree) for x in charts])
-    return jnp.moveaxis(profiles, -1, 0).swapaxes(1, 2).reshape(profiles.shape[-1], -1), maps
+    a = jnp.einsum("al,lasv->sav", like.reduce, _centred(c, like.mirror, swaps)[:, like.degree + m])
+    profiles = jnp.moveaxis(_views.spline_table(a, m), -1, 0).swapaxes(1, 2)  # [V+4, maps, s]
+    charts = jnp.stack([e, rotate(e, jnp.asarray(_CHART_X, e.dtype))])
+    maps = jax.lax.map(lambda e: _chart(_series(e, like.order, like.expand, swaps)), charts)
+    return profiles.reshape(len(profiles), -1), maps.reshape(-1, maps.shape[-1])
 
 
-def _of_orders(factors: Float[Array, "rows l"], m: Array, degree: int) -> Float[Array, "rows n"]:
-    """From coefficients to sums over bands of their orders m, one for each row."""
-    return jnp.where(_tables.orders(degree)[None] == m[:, None], factors[:, _tables.bands(degree)], 0)
+def _series(
+    e: Float[Array, "s n"], order: Array, expand: Float[Array, "maps l"], swaps: Float[Array, "l m m"]
+) -> Float[Array, "theta phi b"]:
+    """All maps, colours last, as Fourier series in theta and phi: cosines of 0 ... L, then sines.
+
+    The frame (theta, phi, s) turns the light's bands by Ry(-theta) Rz(-phi), J Z(theta) J Z(-phi) on coefficients, and
+    the entries of Z(g) are cosines and sines of k g: these series are exact.
+    """
+    degree = len(swaps) - 1
+
+    def halves(x: Array) -> tuple[Array, Array]:
+        return x[..., degree:], x[..., degree::-1].at[..., 0].set(0)  # order 0 counts once
+
+    (plus, minus), (j_plus, j_minus) = halves(_banded(e)[..., None, :]), halves(swaps[None])  # [s, l, k, c]: c in phi
+    turned = jnp.concatenate([j_plus * plus + j_minus * minus, j_plus * minus - j_minus * plus], axis=-1)
+    turned = jnp.moveaxis(turned, 2, -1)  # [s, l, c, k]: k in theta
+    turned = jnp.concatenate(halves(turned), axis=1)
+    plus, minus = halves(swaps[:, degree + order] * expand.T[..., None])  # [l, maps, k]
+    rows = jnp.stack([jnp.concatenate([plus, minus]), jnp.concatenate([minus, -plus])])
+    series = jnp.einsum("wlak,slck->wkcas", rows, turned)
+    return series.reshape(2 * degree + 2, 2 * degree + 2, -1)
 
 
 def _grid(degree: int) -> tuple[int, int, int]:
@@ -223,31 +259,19 @@ def _grid(degree: int) -> tuple[int, int, int]:
     return rows, rows // 4 - 2, rows // 2 + 5
 
 
-def _chart(e: Float[Array, "s n"], combine: Array, m: Array, degree: int) -> Float[Array, "texels maps"]:
-    """Spline coefficients of all maps over the belt of one chart, colours last."""
+def _chart(series: Float[Array, "theta phi b"]) -> Float[Array, "texels b"]:
+    """Spline coefficients of periodic series over the belt of one chart."""
+    degree = len(series) // 2 - 1
     rows, first, kept = _grid(degree)
-    theta, phi = np.meshgrid(
-        np.pi * (np.arange(rows) + 0.5) / rows, np.pi * (np.arange(2 * rows) + 0.5) / rows, indexing="ij"
-    )
-    sin, cos, c, s = np.sin(theta), np.cos(theta), np.cos(phi), np.sin(phi)
-    frames = np.stack([[cos * c, cos * s, -sin], [-s, c, 0 * c], [sin * c, sin * s, cos]])  # [axis, xyz, ...]
-    frames = jnp.asarray(frames.transpose(2, 3, 0, 1).reshape(rows, -1, 3, 3), e.dtype)  # a row of texels at a time
+    k = np.arange(degree + 1)
+    through = 3 / (2 + np.cos(k * np.pi / rows))  # splines through the nodes
 
-    def row(turn: Array) -> Array:
-        light = rotate_many(e, turn, degree)  # [n, s, p]
-        return jnp.moveaxis(jnp.tensordot(combine, light, 1), -1, 0)
+    def waves(node: np.ndarray) -> Array:
+        angle = np.pi * (node[:, None] + 0.5) / rows * k
+        return jnp.asarray(np.concatenate([np.cos(angle) * through, np.sin(angle) * through], axis=1), series.dtype)
 
-    values = jax.lax.map(jax.checkpoint(row), frames)  # [rows, 2 rows, maps, s]
-    # past a pole: the other side, in a frame turned by half a turn
-    sign = jnp.where(m % 2 == 0, 1, -1)[None, None, :, None].astype(e.dtype)
-    around = jnp.concatenate([values, jnp.roll(values[::-1], rows, axis=1) * sign])
-    k = np.fft.fftfreq(2 * rows) * 2 * np.pi
-    symbol = (2 + np.cos(k)) / 3
-    spectrum = jnp.fft.fft2(around, axes=(0, 1))
-    spectrum *= jnp.asarray(1 / np.outer(symbol, symbol)[..., None, None], spectrum.dtype)
-    splines = jnp.fft.ifft2(spectrum, axes=(0, 1)).real
-    columns = np.arange(-2, 2 * rows + 2) % (2 * rows)
-    return splines[first : first + kept][:, columns].reshape(kept * len(columns), -1)
+    belt = jnp.tensordot(waves(first + np.arange(kept)), series, 1)
+    return jnp.einsum("pc,tcb->tpb", waves(np.arange(-2, 2 * rows + 2)), belt).reshape(-1, belt.shape[-1])
 
 
 # ---- lookups
