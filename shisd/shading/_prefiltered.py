@@ -31,14 +31,13 @@ from shisd import _checks
 from shisd._numerics import normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, Float, Scalar
-from shisd.harmonics import _tables, rotate
+from shisd.harmonics import _tables
 from shisd.shading import _views
 from shisd.shading._lobes import Lobes, check_lobes
 from shisd.shading._surface import in_tiles, shade_points
 
 _TILE = 2048  # pixels at a time
 _ROWS_PER_BAND = 3  # texels from pole to pole for each band: cubic splines are then good to 1e-3 of the highest one
-_CHART_X = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # world to the chart whose pole is x
 
 
 class PrefilteredLobes(eqx.Module):
@@ -225,13 +224,22 @@ def _filter(
     m = jnp.abs(like.order)
     a = jnp.einsum("al,lasv->sav", like.reduce, _centred(c, like.mirror, swaps)[:, like.degree + m])
     profiles = jnp.moveaxis(_views.spline_table(a, m), -1, 0).swapaxes(1, 2)  # [V+4, maps, s]
-    charts = jnp.stack([e, rotate(e, jnp.asarray(_CHART_X, e.dtype))])
+    e = _banded(e)
+    charts = jnp.stack([e, _about_x(e, swaps)])
     maps = jax.lax.map(lambda e: _chart(_series(e, like.order, like.expand, swaps)), charts)
     return profiles.reshape(len(profiles), -1), maps.reshape(-1, maps.shape[-1])
 
 
+def _about_x(e: Float[Array, "s l m"], swaps: Float[Array, "l m m"]) -> Float[Array, "s l m"]:
+    """Light in the chart whose pole is x and whose axes are (y, z, x): x and y exchanged, then y and z."""
+    m = np.arange(swaps.shape[1]) - swaps.shape[1] // 2
+    same, other = np.cos(m * np.pi / 2) * np.where(m < 0, -1, 1), np.sin(np.abs(m) * np.pi / 2)  # phi to pi/2 - phi
+    same, other = (jnp.asarray(np.round(x)[None, None], e.dtype) for x in (same, other))
+    return jnp.einsum("lkm,slm->slk", swaps, same * e + other * e[..., ::-1])
+
+
 def _series(
-    e: Float[Array, "s n"], order: Array, expand: Float[Array, "maps l"], swaps: Float[Array, "l m m"]
+    e: Float[Array, "s l m"], order: Array, expand: Float[Array, "maps l"], swaps: Float[Array, "l m m"]
 ) -> Float[Array, "theta phi b"]:
     """All maps, colours last, as Fourier series in theta and phi: cosines of 0 ... L, then sines.
 
@@ -243,7 +251,7 @@ def _series(
     def halves(x: Array) -> tuple[Array, Array]:
         return x[..., degree:], x[..., degree::-1].at[..., 0].set(0)  # order 0 counts once
 
-    (plus, minus), (j_plus, j_minus) = halves(_banded(e)[..., None, :]), halves(swaps[None])  # [s, l, k, c]: c in phi
+    (plus, minus), (j_plus, j_minus) = halves(e[..., None, :]), halves(swaps[None])  # [s, l, k, c]: c in phi
     turned = jnp.concatenate([j_plus * plus + j_minus * minus, j_plus * minus - j_minus * plus], axis=-1)
     turned = jnp.moveaxis(turned, 2, -1)  # [s, l, c, k]: k in theta
     turned = jnp.concatenate(halves(turned), axis=1)

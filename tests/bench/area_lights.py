@@ -2,8 +2,8 @@
 
 Every kernel takes its parameters and a `Scene`: a tile of pixels, each in its own frame, whose z axis is the normal and
 whose x axis lies below the view. What is below the horizon counts zero, and so does a light seen from behind. Vectors
-are tuples of components, so that one fused loop makes a sample and weighs it. Materials: `Diffuse` and `Microfacet`,
-the formulas of models.Lambertian and models.Ggx.
+are tuples of components, so that one fused loop makes a sample and weighs it. The material has the formula of
+models.Ggx.
 
 Samples are a lattice of best P_2 among Korobov's, shifted for every pixel by the R_2 sequence (Cranley and Patterson
 1976) and folded by a tent (Hickernell 2002), which for smooth integrands is far ahead of independent numbers.
@@ -103,23 +103,6 @@ def where(condition, a: Vector, b: Vector) -> Vector:
 # ---- materials: f cos, the density of their samples, samples
 
 
-class Diffuse(NamedTuple):
-    albedo: jax.Array
-
-    def cosine_value(self, w: Vector, sine, cosine):
-        return self.albedo / np.pi * jnp.maximum(w[2], 0)
-
-    def density(self, w: Vector, sine, cosine):
-        return jnp.maximum(w[2], 0) / np.pi
-
-    def sample(self, u, v, sine, cosine) -> Vector:
-        return _polar(jnp.sqrt(1 - u), jnp.sqrt(u), v)
-
-    def weight(self, w: Vector, sine, cosine):
-        """f cos over density."""
-        return self.albedo
-
-
 class Microfacet(NamedTuple):
     alpha: jax.Array
     f0: jax.Array
@@ -192,16 +175,6 @@ def _mean(term: Callable, count: int, scene: Scene) -> jax.Array:
 def _fold(x):
     """The tent of the fraction."""
     return 1 - jnp.abs(2 * (x - jnp.floor(x)) - 1)
-
-
-def by_area(count: int, material, scene: Scene):
-    """Points of a lattice on the quad, a bilinear patch: uniform in area on parallelograms. No clipping."""
-
-    def term(u, v):
-        w, solid_angle = patch(u, v, scene.corners)
-        return material.cosine_value(w, scene.sine, scene.cosine) * solid_angle
-
-    return _mean(term, count, scene)
 
 
 def gauss_points(side: int, material, scene: Scene):
@@ -506,7 +479,7 @@ def solid_angle(edges: list) -> jax.Array:
 class Lit(NamedTuple):
     """A material times the radiance that comes from afar, looked up by the direction in world space."""
 
-    material: Diffuse | Microfacet
+    material: Microfacet
     texels: jax.Array
     frame: tuple
 

@@ -8,7 +8,7 @@ ours: slices on rotated zonal harmonics, `shading.shade_environment`; maps filte
 Monte Carlo, point lights: tests/bench/monte_carlo.py. SH rotation: tests/bench/sh_rotation.py, on the same slices.
 Split sum: tests/bench/split_sum.py. Spherical Gaussians: tests/bench/lobes.py.
 Gradients: value and derivatives in normals, views, and the light's coefficients, texels or filtered texels, of a sum
-over all pixels and colours; asked for with one map and one material, as their cost depends on no numbers.
+over all pixels and colours; with one map, one material and some settings, as their cost depends on no numbers.
 `setup` leaves compiling out: tables of the material and of the map, projection, fits (stored, with their seconds). For
 every degree of ours and of SH rotation it is that of the highest degree, whose table they share.
 
@@ -43,6 +43,7 @@ MATERIALS = {
 }
 MAPS = ("interior", "studio", "sun")
 DEGREES, VIEWS = (4, 8, 16, 30), 32
+DIFFERENTIATED = {"degree 8", "degree 16", "tolerance 0.01", "16", "64", "64 x 128 map", "3 lobes"}  # settings
 PARTS = ("directions", "sharpness", "weights")  # of a table of Gaussians
 
 
@@ -340,8 +341,8 @@ def tasks(quick: bool) -> Iterator[Task]:
         for name in ("interior",) if quick else MAPS:
             scene, title = Scene(material, name, quick), f"{material}, {name}"
             methods = [method for family in FAMILIES for method in family(scene)]
-            if not scene.with_gradients:
-                methods = [replace(method, gradient=None) for method in methods]
+            differentiated = DIFFERENTIATED if scene.with_gradients else ()
+            methods = [m if m.setting in differentiated else replace(m, gradient=None) for m in methods]
             yield Task(
                 f"environment: {title}", title, "pixel", pixels(), stored[title], float(stored[f"{title}: error"]),
                 methods, count=SIDE**2,
