@@ -78,7 +78,7 @@ def general(brdf, light, degree, views=64):
     return lambda p, n, v: shading.shade_environment(lobes, e, n, v)
 
 
-def bench_prediction(degrees=(2, 4, 8, 16, 24), count=1024, names=("interior", "studio")):
+def bench_prediction(degrees=(4, 8, 16), count=1024, names=("interior", "studio")):
     """Relative RMS error of truncation at a degree: predicted from band energies, and measured.
 
     Maps of 64 x 128 and a square lamp, pixels turned in all ways. Measured against quadrature of the material itself;
