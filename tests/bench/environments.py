@@ -43,7 +43,7 @@ MATERIALS = {
 }
 MAPS = ("interior", "studio", "sun")
 DEGREES, VIEWS = (4, 8, 16, 30), 32
-DIFFERENTIATED = {"degree 8", "degree 16", "tolerance 0.01", "16", "64", "64 x 128 map", "3 lobes"}  # settings
+DIFFERENTIATED = {"degree 16", "tolerance 0.01", "16", "64 x 128 map", "3 lobes"}  # settings
 PARTS = ("directions", "sharpness", "weights")  # of a table of Gaussians
 
 

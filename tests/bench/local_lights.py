@@ -170,7 +170,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
 
     for degree in (4, 8, 12, 20)[half]:
         table, seconds = fitted_lobes(name, degree)
-        differentiated = shade_polygon if degree in (8, 20) else None  # compiling a derivative takes 10 s
+        differentiated = shade_polygon if degree == 8 else None  # compiling a derivative takes 10 s
         add("shisd", f"degree {degree}", shade_polygon, table, differentiated, setup=seconds, ours=True)
     for family, kernel, differentiable in (
         ("Gauss points", area_lights.gauss_points, True),
@@ -181,7 +181,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
         for side in (2, 4, 8, 16)[half]:
             gauss = family == "Gauss points"
             count, setting = (side, f"{side} x {side}") if gauss else (side * side, f"{side * side} samples")
-            small = shaded(kernel, count, size=SMALL) if differentiable and side in (4, 16) else None
+            small = shaded(kernel, count, size=SMALL) if differentiable and side == 4 else None
             add(family, setting, shaded(kernel, count), material, small)
     table, seconds = fitted_cosines(name)
     kernel = shaded(area_lights.transformed_cosines, size=SMALL)
@@ -209,7 +209,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
 
 def portal_task(name: str, stored) -> Task:
     coefficients, methods = stored["portal light"], []
-    for degree in (4, 8, 12):
+    for degree in (4, 12):
         table, seconds = fitted_lobes(name, degree)
         light, more = timed(models.PortalLight, QUADS["floor"], coefficients, degree)
         parameters = table, light
@@ -251,7 +251,7 @@ def projection_task(degree: int, stored, quick: bool) -> Task:
         for count in (16, 64, 256)[half]:
             setting = f"{int(count**0.5)} x {int(count**0.5)}" if gauss else f"{count} samples"
             kernel = projected(area_lights.project_points, degree, count, gauss, size=max(16, 2048 // count))
-            differentiated = gradient(kernel) if gauss and count < 256 else None
+            differentiated = gradient(kernel) if gauss and count < 64 else None
             methods.append(Method(family, setting, kernel, weights, differentiated))
     kernel = projected(area_lights.project_lines, degree)
     methods.append(Method("line quadrature", f"degree {degree}", kernel, weights))

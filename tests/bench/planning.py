@@ -1,7 +1,6 @@
 """What `planning` predicts against what quadrature measures, and what a plan saves."""
 
 import functools
-import inspect
 
 import jax.numpy as jnp
 import numpy as np
@@ -149,9 +148,3 @@ def bench_saving(tolerances=(0.1, 0.05), count=16384, judged=512):
             })  # fmt: skip
             print(rows[-1], flush=True)
     return rows
-
-
-def tables(quick: bool) -> dict[str, list[dict]]:
-    """Title and rows of both tables; nothing when quick."""
-    benches = () if quick else (bench_prediction, bench_saving)
-    return {inspect.cleandoc(bench.__doc__ or ""): bench() for bench in benches}

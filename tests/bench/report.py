@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from tests.bench import environments, harness, local_lights, planning, renderers, roofline, spherical, stability
+from tests.bench import environments, harness, local_lights, renderers, roofline, spherical
 from tests.bench.run import paste, table
 
 GROUPS = {  # name: (title, tasks)
@@ -23,7 +23,7 @@ GROUPS = {  # name: (title, tasks)
     "spherical": ("Spherical harmonics", spherical.tasks),
     "renderers": ("Whole pictures", renderers.tasks),
 }
-TABLES = {"planning": planning.tables, "roofline": roofline.tables, "stability": stability.tables}
+TABLES = {"roofline": roofline.tables}
 
 
 def summary(panels: dict[str, list[dict]], item: str) -> list[dict]:

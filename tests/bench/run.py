@@ -21,7 +21,7 @@ import numpy as np
 from shisd import decomposition, domains, models, reference, shading
 from shisd.domains import _moments
 from shisd.harmonics import _tables
-from tests.bench import conditioning, equation_22, lobes, native, polygons
+from tests.bench import conditioning, equation_22, lobes, native, planning, polygons, stability
 from tests.bench.timing import interleaved
 from tests.truth import zonal_moments
 
@@ -259,6 +259,9 @@ BENCHES = {
     "kernels": conditioning.bench_kernels,
     "kernel_pictures": conditioning.bench_kernel_pictures,
     "lobes": lobes.compare,
+    "prediction": planning.bench_prediction,
+    "saving": planning.bench_saving,
+    "stability": stability.bench_stability,
 }
 FIGURES = {
     "polygon_degree": ("polygon_cost.png", cost_figure),
@@ -268,6 +271,8 @@ FIGURES = {
 README = {  # markers, and the benchmarks whose tables stand between them
     "conditioning": ("directions", "objectives", "kernels", "kernel_pictures"),
     "lobes": ("lobes",),
+    "planning": ("prediction", "saving"),
+    "stability": ("stability",),
 }
 README["bench"] = tuple(name for name in BENCHES if not any(name in names for names in README.values()))
 

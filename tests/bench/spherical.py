@@ -244,9 +244,7 @@ def basis(degree: int, quick: bool) -> Task:
         value = _sphericart_jax(degree)
         methods.append(compiled("sphericart-jax", "float32", value, d @ HALF_TURN, w, gradient=differentiated))
     if installed("e3nn_jax") and small:
-        methods.append(
-            compiled("e3nn-jax", "float32", _e3nn_basis(degree), d @ E3NN_TURN.T, w, gradient=False)
-        )
+        methods.append(compiled("e3nn-jax", "float32", _e3nn_basis(degree), d @ E3NN_TURN.T, w, gradient=False))
     if installed("spexial") and small:
         methods.append(compiled("spexial", "float32", _spexial_basis(degree), d, w))
     if degree <= 16 and not quick:

@@ -6,7 +6,6 @@ polygons by area quadrature, materials by their textbook formulas, derivatives b
 
 import functools
 import importlib.util
-import inspect
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -43,11 +42,6 @@ def bench_stability():
     """
     groups = (harmonics_rows, axes_rows, polygon_rows, shading_rows, roughness_rows, material_rows, light_rows)
     return [row for group in groups for row in group()]
-
-
-def tables(quick: bool) -> dict[str, list[dict]]:
-    """Title and rows of the table; nothing when quick."""
-    return {} if quick else {inspect.cleandoc(bench_stability.__doc__ or ""): bench_stability()}
 
 
 def row(case: str, what: str, ours: list, peer: str = "-", theirs: list | None = None) -> dict:
