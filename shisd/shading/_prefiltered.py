@@ -290,9 +290,8 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
     material, light = (int(np.prod(c)) for c in lobes.colours)
     rows, first, kept = _grid(lobes.degree)
     width, count = 2 * rows + 4, len(lobes.order)
-    k = np.arange(lobes.highest + 1, dtype=np.int32)[
-        :, None
-    ]  # indexed copies and jnp.sum would be slow: both are products
+    # indexed copies and jnp.sum would be slow: both are products
+    k = np.arange(lobes.highest + 1, dtype=np.int32)[:, None]
     choose = jnp.concatenate([k == lobes.order[None], -k == lobes.order[None]]).astype(lobes.maps.dtype)
     sums = jnp.tile(jnp.eye(max(material, light), dtype=lobes.maps.dtype), (count, 1))
 
