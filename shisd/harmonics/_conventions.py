@@ -68,20 +68,10 @@ def _turn(c: Float[Array, "*batch n"], back: bool) -> Float[Array, "*batch n"]:
     for l, swap in enumerate(_tables.swap_matrices(degree)):
         m = np.arange(-l, l + 1)
         signs = np.where(m % 2 == 1, -1, 1)
-        turn = _quarter_mirror(l) @ (signs[:, None] * swap * signs)
+        turn = _tables.quarter_mirror(l) @ (signs[:, None] * swap * signs)
         turn = jnp.asarray(turn.T if back else turn, c.dtype)
         bands.append(jnp.einsum("ij,...j->...i", turn, c[..., l * l : (l + 1) ** 2]))
     return jnp.concatenate(bands, axis=-1)
-
-
-def _quarter_mirror(l: int) -> np.ndarray:
-    """phi -> pi/2 - phi on one band of real harmonics: cos(m phi) and sin(m phi) of each order are mixed."""
-    m = np.arange(-l, l + 1)
-    cos, sin = np.round(np.cos(np.abs(m) * np.pi / 2)), np.round(np.sin(np.abs(m) * np.pi / 2))
-    mirror = np.zeros((2 * l + 1,) * 2)
-    mirror[l + m, l + m] = np.where(m < 0, -cos, cos)
-    mirror[l + m, l - m] += np.where(m == 0, 0, sin)
-    return mirror
 
 
 def _complex_coefficients(value: ArrayLike) -> Array:

@@ -218,6 +218,16 @@ def swap_matrices(degree: int) -> tuple[np.ndarray, ...]:
     return tuple(matrices)
 
 
+def quarter_mirror(l: int) -> np.ndarray:
+    """x and y exchanged, phi -> pi/2 - phi, on one band: cos(m phi) and sin(m phi) of each order are mixed."""
+    m = np.arange(-l, l + 1)
+    cos, sin = np.round(np.cos(np.abs(m) * np.pi / 2)), np.round(np.sin(np.abs(m) * np.pi / 2))
+    mirror = np.zeros((2 * l + 1,) * 2)
+    mirror[l + m, l + m] = np.where(m < 0, -cos, cos)
+    mirror[l + m, l - m] += np.where(m == 0, 0, sin)
+    return mirror
+
+
 def _wigner_start(degree: int) -> np.ndarray:
     """d^j_(m, m')(pi/2) with j = max(|m|, |m'|), for every m, m': 2^-j sqrt(binomial(2j, j + m')) up to a sign."""
     d = np.zeros((2 * degree + 1,) * 2)

@@ -232,10 +232,8 @@ def _filter(
 
 def _about_x(e: Float[Array, "s l m"], swaps: Float[Array, "l m m"]) -> Float[Array, "s l m"]:
     """Light in the chart whose pole is x and whose axes are (y, z, x): x and y exchanged, then y and z."""
-    m = np.arange(swaps.shape[1]) - swaps.shape[1] // 2
-    same, other = np.cos(m * np.pi / 2) * np.where(m < 0, -1, 1), np.sin(np.abs(m) * np.pi / 2)  # phi to pi/2 - phi
-    same, other = (jnp.asarray(np.round(x)[None, None], e.dtype) for x in (same, other))
-    return jnp.einsum("lkm,slm->slk", swaps, same * e + other * e[..., ::-1])
+    mirror = jnp.asarray(_tables.quarter_mirror(len(swaps) - 1), e.dtype)  # of the highest band: it holds all others
+    return jnp.einsum("lkm,slm->slk", swaps, e @ mirror)
 
 
 def _series(
@@ -244,7 +242,8 @@ def _series(
     """All maps, colours last, as Fourier series in theta and phi: cosines of 0 ... L, then sines.
 
     The frame (theta, phi, s) turns the light's bands by Ry(-theta) Rz(-phi), J Z(theta) J Z(-phi) on coefficients, and
-    the entries of Z(g) are cosines and sines of k g: these series are exact.
+    the entries of Z(g) are cosines and sines of k g: these series are exact, as Risbo's of Wigner's d (1996). The
+    bands stand in one padded array, which compiles in a moment; `_rotation.swapped_series` has one product for each.
     """
     degree = len(swaps) - 1
 

@@ -4,15 +4,15 @@ Scenes, float32, 16,384 points: a floor with slightly varied normals, views to 8
 ("floor") or beside a screen that stands on it, from 0.1 of its height on ("wall").
 
 Families (kernels and their sources: `area_lights`): ours, `shade_polygon` with lobes fitted above the horizon; Gauss
-points on the light; Monte Carlo by solid angle, by the material, by both, all with shifted lattices;
-linearly transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the light by Xu et al.'s
-rule; the light's harmonics, turned to the local frame; axial moments. Points and samples of a portal look the distant
-light up in a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the lobes'
-degree. Derivatives are measured in the full run, in one polygon task, as their cost depends on no numbers: of ours,
-points and samples of the light and transformed cosines; for projections of ours and of points.
-Those of points and samples are of the sum as it stands, without what happens where the light crosses the horizon, and
-by JAX's reverse mode, which XLA recomputes in many places: derivatives written by hand would be faster. Samples of the
-material have none, since what is lit or not jumps; of the other routes and of portals they are not measured.
+points on the light; Monte Carlo by solid angle, by the material, by both, all with shifted lattices; linearly
+transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the light by Xu et al.'s rule; the
+light's harmonics, turned to the local frame; axial moments. Points and samples of a portal look the distant light up in
+a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the lobes' degree.
+Derivatives are measured in the full run, in one polygon task, as their cost depends on no numbers: of ours, points and
+samples of the light and transformed cosines; for projections of ours and of points. Those of points and samples are of
+the sum as it stands, without what happens where the light crosses the horizon, and by JAX's reverse mode, which XLA
+recomputes in many places: derivatives written by hand would be faster. Samples of the material have none, since what is
+lit or not jumps; of the other routes and of portals they are not measured.
 
 References: `reference.shade_polygon_quadrature` in float64 for the first 256 points, and for projections SciPy's
 harmonics on a rule for spherical triangles; errors are the differences to coarser rules.

@@ -41,7 +41,7 @@ PEERS = {  # by module
 }
 POINTS, HEIGHT, ROTATIONS, EXPANSIONS, PRODUCTS = 10_000, 512, 1000, 1024, 64
 POINTS_JUDGED, ROTATIONS_JUDGED, EXPANSIONS_JUDGED, PRODUCTS_JUDGED = 200, 4, 8, 2
-ROTATION_DEGREES, BATCH_DEGREES = (8, 16, 30), (8, 30)
+ROTATION_DEGREES, BATCH_DEGREES = (8, 30), (8,)
 SMALL = 8  # the highest degree of e3nn-jax, spexial and the dense tensor of triple products
 DIFFERENTIATED = 30  # the highest degree of gradients: at 64, sphericart's table of derivatives takes 1 GB in float64
 S2FFT_DEGREE = HEIGHT // 2 - 1
@@ -71,8 +71,8 @@ def tasks(quick: bool) -> list[Task]:
         basis: (8, 30, 64),
         expansion: (8, 30, 64),
         projection: (64,),
-        rotation: (8, 30),
-        batch_rotation: (8,),
+        rotation: ROTATION_DEGREES,
+        batch_rotation: BATCH_DEGREES,
         product: (8, 30),
     }
     if quick:
