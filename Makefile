@@ -15,7 +15,7 @@ help:
 	@echo "make test-slow  the slow tests: examples, notebooks, convergence"
 	@echo "make lint       ruff and pyright"
 	@echo "make report     speed against error, beside other methods, to output/report; QUICK=1 for a few of them, README=1 also there"
-	@echo "make bench      studies behind the choices of the library: axes, kernels, recurrences"
+	@echo "make bench      studies behind the choices of the library: axes, kernels, recurrences, planning, stability"
 	@echo "make clean      remove .venv and output"
 
 demo: $(VENV)/.demo

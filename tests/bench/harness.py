@@ -148,7 +148,7 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     columns = min(columns, len(panels))
     rows_of_panels = -(-len(panels) // columns)
@@ -176,6 +176,8 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
         if rows[0]["reference error"] > 0:
             axis.axhline(rows[0]["reference error"], color="k", lw=0.7, ls=":", label="error of the reference")
         axis.set_title(title, fontsize=9)
+        axis.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))  # where labels of all digits would overlap
+        axis.xaxis.set_minor_formatter(ticker.LogFormatterSciNotation(minor_thresholds=(2, 1)))
         axis.grid(True, which="major", alpha=0.3)
     for axis in axes.flat[len(panels) :]:
         axis.set_axis_off()
