@@ -1,8 +1,11 @@
 """Small numerical helpers that every stage shares."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial
 
 from shisd._typing import Array, Float
 
@@ -78,3 +81,37 @@ def safe_sqrt(x: Array) -> Array:
     """Square roots whose derivative at 0 is 0, not infinite."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
+@jax.custom_jvp
+def arctan2(y: Array, x: Array) -> Array:
+    """The angle of (x, y) in (-pi, pi], to 3e-7 in float32 and 2e-15 in float64; 0 and -0 are the same.
+
+    jnp.arctan2 is a call for every element on a CPU, which keeps all that is computed with it from vector code.
+    """
+    a, b = jnp.abs(y), jnp.abs(x)
+    large, small = jnp.maximum(a, b), jnp.minimum(a, b)
+    wide = small > np.tan(np.pi / 8) * large  # then the angle to the diagonal
+    over = jnp.where(wide, small + large, jnp.where(large > 0, large, 1))
+    t = jnp.where(wide, small - large, small) / over
+    series = jnp.zeros_like(t)
+    for coefficient in _arctan_series(13 if t.dtype.itemsize > 4 else 6)[::-1]:
+        series = series * (t * t) + coefficient
+    angle = jnp.where(wide, np.pi / 4, 0) + t * series
+    angle = jnp.where(a > b, np.pi / 2 - angle, angle)
+    angle = jnp.where(x < 0, np.pi - angle, angle)
+    return jnp.where(y < 0, -angle, angle)
+
+
+@arctan2.defjvp
+def _arctan2_jvp(primals, tangents):
+    (y, x), (dy, dx) = primals, tangents
+    return arctan2(y, x), (x * dy - y * dx) / (x * x + y * y)
+
+
+@functools.cache
+def _arctan_series(degree: int) -> list[float]:
+    """Coefficients of arctan(t) / t over powers of t^2, for t up to tan(pi / 8)."""
+    quotient = lambda t2: np.arctan(np.sqrt(t2)) / np.sqrt(t2)
+    near = Chebyshev.interpolate(quotient, degree, domain=[0, np.tan(np.pi / 8) ** 2])
+    return [float(c) for c in near.convert(kind=Polynomial).coef]

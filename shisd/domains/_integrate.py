@@ -159,7 +159,7 @@ def fold_expansion(
     for l, matrix in enumerate(inverse):
         weights.append(jnp.asarray(matrix.T / max(l * (l + 1), 1)) @ c[used : used + len(matrix)])
         used += len(matrix)
-    return _moments.fold(jnp.stack(weights), jnp.asarray(axes), v, len(inverse) - 1, spare)
+    return _moments.fold(jnp.stack(weights, axis=1), jnp.asarray(axes), v, len(inverse) - 1, spare)
 
 
 @functools.cache

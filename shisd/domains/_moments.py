@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from shisd._numerics import cross, dot, safe_sqrt
+from shisd._numerics import arctan2, cross, dot, safe_sqrt
 from shisd._typing import Array, Float
 
 Loop = Float[Array, "3 s p"]
@@ -49,9 +49,9 @@ _OPERATIONS = 1600  # in one kernel: XLA cuts longer ones up, which makes them s
 
 
 def fold(
-    weights: Float[Array, "l k q"], axes: Float[Array, "k 3"], v: Loop, degree: int, spare: int = 0
+    weights: Float[Array, "k l q"], axes: Float[Array, "k 3"], v: Loop, degree: int, spare: int = 0
 ) -> Float[Array, " p"]:
-    """sum over k and l >= 1 of weights[l, k] l (l+1) I_l(axes[k]) for every polygon. Weights may be shared (q = 1).
+    """sum over k and l >= 1 of weights[k, l] l (l+1) I_l(axes[k]) for every polygon. Weights may be shared (q = 1).
 
     The last `spare` edges cost time only if one of them has a length, in any polygon.
     """
@@ -62,10 +62,10 @@ def fold(
     return _sum_all(moments(axes, v, degree) * _by_degree(weights))
 
 
-def _by_degree(weights: Float[Array, "l k q"]) -> Array:
+def _by_degree(weights: Float[Array, "k l q"]) -> Float[Array, "l k q"]:
     """Weights of I_l, from l = 1 on."""
-    l = np.arange(1, weights.shape[0])
-    return weights[1:] * jnp.asarray(l * (l + 1), weights.dtype)[:, None, None]
+    l = np.arange(1, weights.shape[1])
+    return jnp.swapaxes(weights, 0, 1)[1:] * jnp.asarray(l * (l + 1), weights.dtype)[:, None, None]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
@@ -142,7 +142,7 @@ _fold.defjvp(_fold_jvp, symbolic_zeros=True)
 
 @functools.partial(jax.jit, static_argnames="degree")
 def _fold_boundary(weights: Array, axes: Array, spans: Float[Array, "rows e p"], degree: int) -> tuple[Array, Array]:
-    """sum over k and l of weights[l, k] l (l+1) times the integrals of `_at_vertices`, [e, p] each.
+    """sum over k and l of weights[k, l] l (l+1) times the integrals of `_at_vertices`, [e, p] each.
 
     Both sums are the parts of one complex number: of two results XLA would make two kernels, each with all the work.
     """
@@ -175,7 +175,7 @@ def _for_axes(body: Callable, value: Value, axes: Array, weights: Array) -> Valu
     Axis and weights are fetched a step ahead: the body then reads arrays, not rows at an address that it has to find,
     which would keep LLVM from vector code.
     """
-    fetch = lambda k: (axes[k], weights[:, k])
+    fetch = lambda k: (axes[k], weights[k])
 
     def step(state: tuple, following: Array) -> tuple[tuple, None]:
         value, (d, w) = state
@@ -611,4 +611,4 @@ def _arctan_tail(t2: Array) -> Array:
     for k in range(9, 0, -1):
         series = x * ((-1.0) ** k / (2 * k + 1) + series)
     t = jnp.sqrt(jnp.where(small, 1, t2))
-    return jnp.where(small, series, jnp.arctan(t) / t - 1)
+    return jnp.where(small, series, arctan2(t, jnp.ones_like(t)) / t - 1)

@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import cross, dot, normalize
+from shisd._numerics import arctan2, cross, dot, normalize
 from shisd._typing import Array, Float, Scalar
 from shisd.domains._moments import Loop
 
@@ -129,7 +129,7 @@ def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | No
     following = jnp.roll(v, -1, axis=1)
     across = dot(apex - v, cross(v, following - v))
     along = 1 + dot(apex, v) + dot(apex, following) + dot(v, following)
-    angle = 2 * jnp.sum(jnp.arctan2(across, along), axis=0)
+    angle = 2 * jnp.sum(arctan2(across, along), axis=0)
     turns = jnp.floor((largest - angle) / (4 * np.pi))
     return angle + (4 * np.pi) * jax.lax.stop_gradient(turns)
 

@@ -196,15 +196,10 @@ def _pair(s: list[Parts], series: Series, a: Waves | None, b: Waves, g: Waves, d
 
 
 def _split(x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], degree: int) -> list[Parts]:
-    parts, used = [], 0
-    for block in _blocks(degree):
-        shapes = [(len(block.swap[0]), len(k), *x.shape[1:]) for k in (block.a, block.b)]
-        middle, end = used + shapes[0][0] * shapes[0][1], used + len(block.plus)
-        xa, ya = (z[used:middle].reshape(shapes[0]) for z in (x, y))
-        xb, yb = (z[middle:end].reshape(shapes[1]) for z in (x, y))
-        parts.append((xa, ya, xb, yb))
-        used = end
-    return parts
+    shapes = [(len(block.swap[0]), len(k)) for block in _blocks(degree) for k in (block.a, block.b)]
+    cut = lambda z: jax.lax.split(z, [degrees * orders for degrees, orders in shapes])  # slices transpose slowly
+    x, y = ([part.reshape(*s, *z.shape[1:]) for part, s in zip(cut(z), shapes, strict=True)] for z in (x, y))
+    return [(x[i], y[i], x[i + 1], y[i + 1]) for i in range(0, len(shapes), 2)]
 
 
 def _swapped(s: list[Parts], degree: int) -> list[Parts]:

@@ -20,7 +20,8 @@ from shisd.harmonics._pairing import pair_many, turned_series
 from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import shade_points, shade_tiles, surface
 
-_NUMBERS_AT_ONCE = 1 << 18  # coefficients of slices held at a time: what one tile of pixels needs stays in cache
+_NUMBERS_AT_ONCE = 3 << 18  # coefficients of slices in a tile: small ones keep one core busy, large ones leave caches
+_LARGEST_TILE = 4096
 
 
 def shade_environment(
@@ -41,7 +42,7 @@ def shade_environment(
     Derivatives: in every floating argument, both modes, any order; smooth where a view lies along its normal and where
     a normal lies along any axis of the world. The cut at the horizon is a discontinuity of the view, with no gradient.
     Accuracy: Eq. 22 to 1e-5 in float32 and 1e-12 in float64, relative to the largest radiance.
-    Cost: about L^3 products per pixel. Memory: one tile of at most 2048 pixels, about 2 MB per array, and the
+    Cost: about L^3 products per pixel. Memory: one tile of at most 4096 pixels, about 3 MB per array, and the
     result; the same with gradients.
     Source: ISD15 Eq. 20-22.
     """
@@ -66,5 +67,5 @@ def _shade(
         return pair_many(*look_up(local), series, to_local, degree, lobes.isotropic).reshape(*colour, -1)
 
     numbers = (degree + 1) ** 2 * int(np.prod(lobes.colour))
-    size = min(2048, 1 << max(1, _NUMBERS_AT_ONCE // numbers).bit_length() - 1)
+    size = min(_LARGEST_TILE, max(1, _NUMBERS_AT_ONCE // numbers))
     return shade_tiles(lobes, points, colour, size, radiance)

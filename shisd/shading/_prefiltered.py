@@ -28,7 +28,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import normalize, safe_sqrt
+from shisd._numerics import arctan2, normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import _tables
@@ -36,7 +36,7 @@ from shisd.shading import _views
 from shisd.shading._lobes import Lobes, check_lobes
 from shisd.shading._surface import in_tiles, shade_points
 
-_TILE = 2048  # pixels at a time
+_TILE, _NUMBERS_AT_ONCE = 1 << 14, 1 << 21  # pixels, and values of all channels for them, at a time
 _ROWS_PER_BAND = 3  # texels from pole to pole for each band: cubic splines are then good to 1e-3 of the highest one
 
 
@@ -309,8 +309,8 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
         cos, sin = _views.azimuth_factors(
             jnp.stack([along, t[:, 1] * c - t[:, 0] * d, cosine], axis=1), lobes.highest + 1
         )
-        row, weight = _cubic(jnp.arctan2(rho, s[:, 2]) * (rows / np.pi) - 0.5)
-        column, weight_2 = _cubic((jnp.arctan2(s[:, 1], s[:, 0]) % (2 * np.pi)) * (rows / np.pi) - 0.5)
+        row, weight = _cubic(arctan2(rho, s[:, 2]) * (rows / np.pi) - 0.5)
+        column, weight_2 = _cubic((arctan2(s[:, 1], s[:, 0]) % (2 * np.pi)) * (rows / np.pi) - 0.5)
         corner = (jnp.clip(row - 1 - first, 0, kept - 4) + jnp.where(polar, kept, 0)) * width + jnp.clip(
             column + 1, 0, width - 4
         )
@@ -318,7 +318,7 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
             lobes.maps, corner, [(i * width + j, a * b) for i, a in enumerate(weight) for j, b in enumerate(weight_2)]
         )
         elevation, weight = _cubic(
-            jnp.arctan2(safe_sqrt(1 - cosine * cosine), cosine) * ((lobes.profiles.shape[0] - 4) * 2 / np.pi) - 0.5
+            arctan2(safe_sqrt(1 - cosine * cosine), cosine) * ((lobes.profiles.shape[0] - 4) * 2 / np.pi) - 0.5
         )
         elevation = jnp.clip(elevation + 1, 0, lobes.profiles.shape[0] - 4)
         a = _lookup(lobes.profiles, elevation, list(enumerate(weight))).reshape(-1, count, material)
@@ -328,7 +328,7 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
         total = jnp.where((cosine < 0)[:, None], 0, total)
         return total.reshape(-1, *np.broadcast_shapes(*lobes.colours))
 
-    return in_tiles(shade, points, _TILE)
+    return in_tiles(shade, points, min(_TILE, max(1, _NUMBERS_AT_ONCE // lobes.maps.shape[1])))
 
 
 def _cubic(x: Float[Array, " p"]) -> tuple[Array, list[Array]]:

@@ -15,6 +15,7 @@ from shisd.shading._lobes import Lobes
 
 Shape = tuple[int, ...]
 _DIRECTIONS = ("normals", "views", "tangents")
+_LANES = 64  # a tile is a multiple of this many points
 
 
 def surface(
@@ -80,13 +81,13 @@ def shade_tiles(
 
 
 def in_tiles(function: Callable[[dict[str, Array]], Array], rows: dict[str, Float[Array, "p 3"]], size: int) -> Array:
-    """function(rows) for `size` rows at a time, the last tile filled up; the backward pass makes each tile again."""
+    """function(rows) for at most `size` rows at a time, all tiles alike; the backward pass makes each tile again."""
     count = len(next(iter(rows.values())))
     if count == 0:
         one = jax.eval_shape(function, {name: jax.ShapeDtypeStruct((1, 3), a.dtype) for name, a in rows.items()})
         return jnp.zeros((0, *one.shape[1:]), one.dtype)
-    size = min(count, size)
     tiles = -(-count // size)
+    size = min(count, size, -(-count // (tiles * _LANES)) * _LANES)  # of equal size, for little to fill up
     fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
     values = jax.lax.map(jax.checkpoint(function), {name: fill(a) for name, a in rows.items()})
     return values.reshape(tiles * size, *values.shape[2:])[:count]

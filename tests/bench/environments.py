@@ -43,7 +43,7 @@ MATERIALS = {
 }
 MAPS = ("interior", "studio", "sun")
 DEGREES, VIEWS = (4, 8, 16, 30), 32
-DIFFERENTIATED = {"degree 16", "tolerance 0.01", "16", "64 x 128 map", "3 lobes"}  # settings
+DIFFERENTIATED = {"degree 16", "tolerance 0.02", "16", "64 x 128 map", "3 lobes"}  # settings
 PARTS = ("directions", "sharpness", "weights")  # of a table of Gaussians
 
 
@@ -184,8 +184,7 @@ def prefiltered(scene: Scene) -> list[Method]:
     for degree in (30,) if scene.quick or scene.material != "GGX 0.1" else (30, 64):
         lobes, seconds = sharp_table(scene.material, degree)
         light = coefficients(scene.map)[0][:, : (degree + 1) ** 2]
-        tolerances = (0.1, 0.03, 0.01, 0.003) if scene.map == "interior" else (0.03, 0.003)
-        tolerances = (0.01,) if degree > 30 else tolerances  # half a minute each
+        tolerances = (0.1, 0.05, 0.02, 0.005) if degree == 30 else (0.01,)
         for tolerance in scene.some(tolerances if scene.glossy else (0.01,)):
             make = functools.partial(shading.prefilter, lobes, light, tolerance=tolerance)
             make()  # compiles, for every number of channels again

@@ -274,7 +274,7 @@ def shade_gaussians(table, pyramid, normals, views):
                 total += weight[..., corner, None] * texels.at[index[..., corner]].get(mode="promise_in_bounds")
         return jnp.einsum("ckp,kpc->pc", weights, total[..., :3])
 
-    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 1024)
+    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 4096)
 
 
 def band_table(environment, degree, height=128):

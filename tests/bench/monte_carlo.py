@@ -23,7 +23,7 @@ import numpy as np
 from shisd._numerics import dot
 
 POOL = 256  # cells of the pool along each side of the unit square
-NUMBERS = 1 << 15  # samples of a tile
+NUMBERS = 1 << 18  # samples of a tile
 
 
 # ---- the light

@@ -13,7 +13,7 @@ from shisd._numerics import dot
 from shisd.harmonics import _tables
 from tests.bench.monte_carlo import in_tiles
 
-NUMBERS = 1 << 18  # coefficients turned at a time
+NUMBERS = 1 << 19  # coefficients turned at a time
 
 
 def radiance(parameters, normals, views, *, turned: str):

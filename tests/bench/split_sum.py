@@ -33,7 +33,7 @@ def radiance(parameters, normals, views, *, glossy: bool):
         table = parameters["scale"]
         return value * ((1 - t) * take(table, lower) + t * take(table, lower + 1))
 
-    return in_tiles(tile, 4096, normals, views)
+    return in_tiles(tile, 1 << 14, normals, views)
 
 
 def lookup(texels, x, y, z):
