@@ -198,8 +198,8 @@ def _pair(s: list[Parts], series: Series, a: Waves | None, b: Waves, g: Waves, d
 def _split(x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], degree: int) -> list[Parts]:
     shapes = [(len(block.swap[0]), len(k)) for block in _blocks(degree) for k in (block.a, block.b)]
     cut = lambda z: jax.lax.split(z, [degrees * orders for degrees, orders in shapes])  # slices transpose slowly
-    x, y = ([part.reshape(*s, *z.shape[1:]) for part, s in zip(cut(z), shapes, strict=True)] for z in (x, y))
-    return [(x[i], y[i], x[i + 1], y[i + 1]) for i in range(0, len(shapes), 2)]
+    plus, minus = ([p.reshape(*s, *z.shape[1:]) for p, s in zip(cut(z), shapes, strict=True)] for z in (x, y))
+    return [(plus[i], minus[i], plus[i + 1], minus[i + 1]) for i in range(0, len(shapes), 2)]
 
 
 def _swapped(s: list[Parts], degree: int) -> list[Parts]:

@@ -168,7 +168,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
         gradient = radiance_gradient(differentiated) if with_gradients and differentiated is not None else None
         methods.append(Method(family, setting, forward, parameters, gradient, **more))
 
-    for degree in (4, 8, 12, 20)[half]:
+    for degree in (4, 12) if quick else (4, 6, 8, 12, 20):
         table, seconds = fitted_lobes(name, degree)
         differentiated = shade_polygon if degree == 8 else None  # compiling a derivative takes 10 s
         add("shisd", f"degree {degree}", shade_polygon, table, differentiated, setup=seconds, ours=True)

@@ -1,12 +1,14 @@
 """How far the fast paths are from what this machine can do: counted work over measured speeds of its kinds.
 
-Three speeds, float32, all cores: products of matrices of the shapes that the paths use, one tile after another;
-elementwise arithmetic in registers (a long polynomial of a short array); copies of large arrays. The bound of a path is
-the time that its products, its arithmetic and the bytes that it must read and write take at these speeds, one after the
-other, with nothing counted for frames, splines, clipping, square roots or loops.
+Three speeds, float32, all cores: products of matrices, at the best of the shapes that the paths use; elementwise
+arithmetic in registers (a long polynomial of a short array); copies of large arrays. The bound of a path is the time
+that its products, its arithmetic and the bytes that it must read and write take at these speeds, one after the other,
+with nothing counted for frames, splines, clipping, square roots or loops. Beside `sh_basis` stands sphericart, C++ with
+a recurrence instead of products: the bound there is that of `sh_basis`.
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +18,11 @@ from shisd import decomposition, harmonics, models, shading
 from shisd.domains._integrate import incidence_inverse
 from shisd.harmonics import _pairing
 from tests.bench import local_lights
+from tests.bench.spherical import installed
 from tests.bench.timing import interleaved
 
 COUNT, VIEWS = 16384, 64
+KINDS = ("products", "operations", "bytes")
 COLUMNS = VIEWS + 4  # of the spline in the elevation of the view
 
 
@@ -26,7 +30,7 @@ def speeds() -> dict[str, float]:
     """Products and operations in 1e9/s, bytes in GB/s."""
     rng = np.random.default_rng(0)
     array = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
-    matrix, tiles, long, big = array(208, COLUMNS), array(16, COLUMNS, 1024), array(1 << 14), array(1 << 25)
+    long, big = array(1 << 14), array(1 << 25)
     steps, repeats = 512, 16
 
     def polynomial(x):
@@ -36,18 +40,18 @@ def speeds() -> dict[str, float]:
             y, z = 0.5 * y + x, 0.25 * z + x
         return y + z
 
-    functions = {
-        "products": lambda: jax.lax.map(lambda x: matrix @ x, tiles),
-        "operations": lambda: jax.lax.fori_loop(0, repeats, lambda _, x: polynomial(x), long),
-        "bytes": lambda: big + 1,
-    }
-    times = interleaved({name: jax.jit(f) for name, f in functions.items()}, seconds=0.5)
     work = {
-        "products": matrix.shape[0] * tiles.size,
-        "operations": 2 * steps * repeats * long.size,
-        "bytes": 2 * big.nbytes,
-    }
-    return {name: work[name] / times[name].best / 1e9 for name in work}
+        ("operations", ""): (2 * steps * repeats * long.size,
+                             lambda: jax.lax.fori_loop(0, repeats, lambda _, x: polynomial(x), long)),
+        ("bytes", ""): (2 * big.nbytes, lambda: big + 1),
+    }  # fmt: skip
+    for tiles, m, k, n in ((16, 208, COLUMNS, 1024), (16, 1024, COLUMNS, 1024), (1, COUNT, 62, 961)):
+        pairs = array(tiles, m, k), array(tiles, k, n)
+        product = lambda pairs=pairs: jax.lax.map(lambda x: x[0] @ x[1], pairs)
+        work["products", f"{m} {k} {n}"] = tiles * m * k * n, product
+    times = interleaved({name: jax.jit(f) for name, (_, f) in work.items()}, seconds=0.5)
+    speed = {name: amount / times[name].best / 1e9 for name, (amount, _) in work.items()}
+    return {kind: max(s for (own, _), s in speed.items() if own == kind) for kind in KINDS}
 
 
 def environment_work(degree: int, colours: int) -> dict[str, float]:
@@ -64,6 +68,19 @@ def polygon_work(degree: int, edges: int) -> dict[str, float]:
     weights = sum(m.size for m in incidence_inverse(degree, np.dtype("float32"))[1])
     steps = (degree + 1) * (degree - 1)
     return {"products": rows * COLUMNS + weights, "operations": steps * (18 * edges + 7)}
+
+
+def basis_work(degree: int) -> dict[str, float]:
+    """Of `sh_basis` for a direction: the polar series, the azimuth's waves by order, and what is read and written."""
+    waves, size = 2 * (degree + 1), (degree + 1) ** 2
+    return {"products": waves * (size + 2 * degree + 1), "bytes": 4.0 * (size + 3)}
+
+
+def sphericart_of(degree: int, directions: np.ndarray) -> Callable:
+    import sphericart
+
+    harmonics = sphericart.SphericalHarmonics(degree)
+    return lambda: harmonics.compute(directions)
 
 
 def tables(quick: bool) -> dict[str, list[dict]]:
@@ -92,9 +109,11 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             ),
             "sh_basis": (
                 functools.partial(harmonics.sh_basis, normals, degree),
-                {"bytes": 4.0 * ((degree + 1) ** 2 + 3)},
+                basis_work(degree),
             ),
         }  # fmt: skip
+        if installed("sphericart"):
+            functions["sphericart, C++"] = (sphericart_of(degree, normals), basis_work(degree))
         times = interleaved({name: f for name, (f, _) in functions.items()}, seconds=0.5)
         for name, (_, work) in functions.items():
             us = times[name].best / COUNT * 1e6

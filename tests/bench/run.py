@@ -98,7 +98,7 @@ def folded(axes, w):
     """The library's weighted sum of moments, of tiles [T, 3, S, p] of polygons; `w` [L+1, K] as for the C++."""
     degree = len(w) - 1
     l = np.maximum(np.arange(degree + 1), 1)
-    scaled = jnp.asarray((w / (l * (l + 1))[:, None])[..., None], jnp.float32)
+    scaled = jnp.asarray((w / (l * (l + 1))[:, None]).T[..., None], jnp.float32)
     tile = jax.checkpoint(lambda v: _moments.fold(scaled, jnp.asarray(axes), v, degree))
     return lambda v: jax.lax.map(tile, v).reshape(-1)
 

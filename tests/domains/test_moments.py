@@ -162,10 +162,10 @@ def test_high_degree_and_fold_agree(dtype, rng):
     v = jnp.asarray(np.stack([random_polygon(rng, 4, s) for s in (1.0, 0.01)]).transpose(2, 1, 0), dtype)
     axes = jnp.asarray(unit(rng.normal(size=(3, 3))), dtype)
     for degree in (1, 7, 40, 70):
-        w = jnp.asarray(rng.normal(size=(degree + 1, 3, 1)), dtype)
-        expected = jnp.einsum("lkp,lkq->p", _moments.moments(axes, v, degree), w[1:])
+        w = jnp.asarray(rng.normal(size=(3, degree + 1, 1)), dtype)
+        expected = jnp.einsum("lkp,klq->p", _moments.moments(axes, v, degree), w[:, 1:])
         l = np.maximum(np.arange(degree + 1), 1)
-        got = _moments.fold(w / jnp.asarray(l * (l + 1), dtype)[:, None, None], axes, v, degree)
+        got = _moments.fold(w / jnp.asarray(l * (l + 1), dtype)[None, :, None], axes, v, degree)
         np.testing.assert_allclose(got, expected, rtol={"float64": 1e-11, "float32": 1e-3}[dtype.name], atol=1e-9)
 
 
