@@ -62,7 +62,7 @@ def fold(
     return _sum_all(moments(axes, v, degree) * _by_degree(weights))
 
 
-def _by_degree(weights: Float[Array, "k l q"]) -> Float[Array, "l k q"]:
+def _by_degree(weights: Float[Array, "k l q"]) -> Float[Array, "bands k q"]:
     """Weights of I_l, from l = 1 on."""
     l = np.arange(1, weights.shape[1])
     return jnp.swapaxes(weights, 0, 1)[1:] * jnp.asarray(l * (l + 1), weights.dtype)[:, None, None]
