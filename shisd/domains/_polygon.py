@@ -145,7 +145,8 @@ def _far_from_opposites(v: Loop) -> Float[Array, "3 p"]:
 
 def on_sphere(points: Loop) -> Loop:
     """Loops of points of any length as unit vertices."""
-    return jnp.moveaxis(normalize(jnp.moveaxis(points, 0, -1)), -1, 0)
+    scaled = points / jax.lax.stop_gradient(jnp.max(jnp.abs(points), axis=0))[None]  # as `normalize`
+    return scaled / jnp.sqrt(dot(scaled, scaled))[None]
 
 
 def clip(points: Loop, height: Float[Array, "s p"]) -> Float[Array, "3 t p"]:
