@@ -176,8 +176,10 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
         if rows[0]["reference error"] > 0:
             axis.axhline(rows[0]["reference error"], color="k", lw=0.7, ls=":", label="error of the reference")
         axis.set_title(title, fontsize=9)
-        axis.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))  # where labels of all digits would overlap
-        axis.xaxis.set_minor_formatter(ticker.LogFormatterSciNotation(minor_thresholds=(2, 1)))
+        low, high = axis.get_xlim()
+        axis.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))
+        if high > 20 * low:  # labels between powers of ten would overlap
+            axis.xaxis.set_minor_formatter(ticker.NullFormatter())
         axis.grid(True, which="major", alpha=0.3)
     for axis in axes.flat[len(panels) :]:
         axis.set_axis_off()
