@@ -36,7 +36,7 @@ from shisd.shading._lobes import Lobes, check_lobes, lookup_factors, lookup_tabl
 from shisd.shading._surface import in_tiles, shade_points, shade_tiles, surface
 
 Light = PolygonLight | PortalLight
-_TILE = 1024  # pixels at a time
+_TILE = 2048  # pixels at a time
 _SMALL_TILE = 128  # where every pixel holds the moments about all axes
 
 
@@ -61,8 +61,8 @@ def shade_polygon(
     quadrature of the material itself, with domain="upper" and degree 20: relative RMSE below 3e-5 for Lambertian, 1e-4
     for GGX of alpha 0.5.
     Cost: moments at L+1 axes, 2L+1 for anisotropic materials, for every pixel, light and colour of the material; half
-    as many edges again where the horizon cuts a light in any of 1024 pixels that follow each other, nothing where it is
-    dark in all; of lights with a profile, that of `shade_portal`. Memory: one tile of 1024 pixels.
+    as many edges again where the horizon cuts a light in any of 2048 pixels that follow each other, nothing where it is
+    dark in all; of lights with a profile, that of `shade_portal`. Memory: one tile of 2048 pixels.
     """
     return _shade_lights(lobes, light, PolygonLight, "light", positions, normals, views, tangents)
 
