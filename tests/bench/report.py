@@ -116,7 +116,7 @@ def main() -> None:
             keep(name, f"{text}\n\n{note}", text)
     report = "\n\n".join(["# Speed against error", note, *(long for _, long in sections.values())]) + "\n"
     (arguments.output / "report.json").write_text(json.dumps(results, indent=1))
-    for folder in folders:
+    for folder in folders[:1] if arguments.only else folders:  # a part does not replace the whole
         (folder / "report.md").write_text(report)
     for name, (short, _) in sections.items() if arguments.readme else ():
         if f"<!-- table:{name} -->" in Path("README.md").read_text():
