@@ -85,7 +85,7 @@ def safe_sqrt(x: Array) -> Array:
 
 @jax.custom_jvp
 def arctan2(y: Array, x: Array) -> Array:
-    """The angle of (x, y) in (-pi, pi], to 3e-7 in float32 and 2e-15 in float64; 0 and -0 are the same.
+    """The angle of (x, y) in (-pi, pi], to 3e-7 in float32 and 3e-15 in float64; 0 and -0 are the same.
 
     jnp.arctan2 is a call for every element on a CPU, which keeps all that is computed with it from vector code.
     """
