@@ -2,12 +2,13 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float, Scalar
-from shisd.harmonics import legendre
+from shisd.harmonics._zh import legendre_of_versine
 
 
 class SphericalCap(eqx.Module):
@@ -29,13 +30,24 @@ class SphericalCap(eqx.Module):
         self.axis, self.angle = normalize(a), size.astype(a.dtype)
 
     def zonal_integrals(self, degree: int) -> Float[Array, " l"]:
-        """2 pi times the integral of P_l(x) from cos(angle) to 1, l = 0 ... degree."""
-        x = jnp.cos(self.angle)
-        p = legendre(x, degree + 1)
-        l = jnp.arange(1, degree + 1)
-        # 1 - x without cancellation; (P_{l-1} - P_{l+1})/(2l+1)
-        first = 2 * jnp.sin(self.angle / 2) ** 2
-        return 2 * jnp.pi * jnp.concatenate([first[None], (p[:degree] - p[2:]) / (2 * l + 1).astype(x.dtype)])
+        """Integrals of P_l(w . axis) over the cap, l = 0 ... degree."""
+        return cap_integrals(2 * jnp.sin(self.angle / 2) ** 2, degree)
+
+
+def cap_integrals(versine: Float[Array, "*batch"], degree: int) -> Float[Array, "*batch l"]:
+    """2 pi times the integrals of P_l(x) from 1 - t to 1, t = `versine` of the cap's angle, in [0, 2].
+
+    By Legendre's equation they are 2 pi (1 - x^2) P_l'(x) / (l (l+1)) at x = 1 - t, and P_l' is the sum of (2k+1) P_k
+    for k = l-1, l-3, ...: no digit is lost in small caps, as it is in (P_{l-1} - P_{l+1}) / (2l+1).
+    """
+    t = versine[..., None]
+    if degree == 0:
+        return 2 * np.pi * t
+    l, k = np.arange(1, degree + 1), np.arange(degree)[:, None]
+    slopes = np.where((k < l) & ((l - k) % 2 == 1), (2 * k + 1) / (l * (l + 1)), 0)
+    p = legendre_of_versine(versine, degree - 1)
+    rest = t * (2 - t) * jnp.matmul(p, jnp.asarray(slopes, t.dtype), precision="highest")
+    return 2 * np.pi * jnp.concatenate([t, rest], axis=-1)
 
 
 def hemisphere(normal: ArrayLike) -> SphericalCap:

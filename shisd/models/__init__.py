@@ -12,6 +12,7 @@ from shisd.models._brdf import Phong as Phong
 from shisd.models._environment import Environment as Environment
 from shisd.models._light import PolygonLight as PolygonLight
 from shisd.models._light import PortalLight as PortalLight
+from shisd.models._light import SphereLight as SphereLight
 from shisd.models._measured import MeasuredBrdf as MeasuredBrdf
 from shisd.models._microfacet_fits import AbcMicrofacet as AbcMicrofacet
 from shisd.models._microfacet_fits import SgdMicrofacet as SgdMicrofacet

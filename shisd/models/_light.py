@@ -3,12 +3,15 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._typing import Array, Float
-from shisd.harmonics import product_matrix
+from shisd._numerics import times
+from shisd._typing import Array, Float, Scalar
+from shisd.domains._region import cap_integrals
+from shisd.harmonics import _tables, product_matrix
 
 
 class PolygonLight(eqx.Module):
@@ -82,3 +85,57 @@ def lobe_product(light: Float[Array, "*colour_n"], degree: int) -> Float[Array, 
     light_degree = _checks.degree_of(light.shape[-1])
     rows = [product_matrix(c, light_degree + degree, input_degree=degree) for c in light.reshape(-1, light.shape[-1])]
     return jnp.stack(rows).reshape(*light.shape[:-1], *rows[0].shape)
+
+
+class SphereLight(eqx.Module):
+    """A ball that emits, from every point of its surface and in all directions, the same radiance (ISD15 section 7.3).
+
+    Arguments: `center` [3] and `radius` > 0, in the unit of length of the scene; `emission`, scalar or [colour], in
+    W/(m2 sr).
+    """
+
+    center: Float[Array, "3"]
+    radius: Scalar
+    emission: Float[Array, "*colour"]
+
+    def __init__(self, center: ArrayLike, radius: ArrayLike, emission: ArrayLike = 1.0):
+        c, r, e = (
+            _checks.vectors("center", center), _checks.real_array("radius", radius),
+            _checks.real_array("emission", emission),
+        )  # fmt: skip
+        if c.shape != (3,) or r.shape != ():
+            raise ValueError(
+                f"`center` must have shape [3] and `radius` be one number; got {list(c.shape)}, {list(r.shape)}."
+            )
+        if e.ndim > 1:
+            raise ValueError(f"`emission` must be a scalar or [colour]; got shape {list(e.shape)}.")
+        dtype = jnp.result_type(c, r, e)
+        self.center, self.radius, self.emission = c.astype(dtype), r.astype(dtype), e.astype(dtype)
+
+    @property
+    def colour(self) -> tuple[int, ...]:
+        return self.emission.shape
+
+    def zonal_coefficients(self, distance: ArrayLike, degree: int) -> Float[Array, "*batch_colour_l"]:
+        """Coefficients of y_l^0 about the direction to the center, of the radiance at a distance from it (Eq. 33).
+
+        Arguments: `distance` [...], in the unit of length of the scene; static `degree`. Returns [..., *colour, L+1].
+        Inside the ball its surface is all around: the constant radiance. At the surface the value jumps by that of a
+        hemisphere; from outside its derivative goes there to infinity, as that of the solid angle does.
+        """
+        d, degree = _checks.real_array("distance", distance), _checks.degree(degree)
+        dtype = jnp.promote_types(d.dtype, self.radius.dtype)
+        d, light = d.astype(dtype), jax.tree.map(lambda x: x.astype(dtype), self)
+        z = cap_integrals(versine(light, d * d), degree) 
+        z = times(z, jnp.asarray(_tables.zonal_norms(degree), dtype))
+        return times(z.reshape(*d.shape, *(1,) * len(self.colour), degree + 1), light.emission[..., None])
+
+
+def versine(light: SphereLight, distance2: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """1 - cos of the angle that a ball covers, by the square of the distance; 2 inside of it.
+
+    With s = sin = radius / distance, it is s^2 / (1 + sqrt(1 - s^2)), which keeps its digits for small balls.
+    """
+    outside = distance2 > light.radius**2
+    sine2 = light.radius**2 / jnp.where(outside, distance2, 2 * light.radius**2)
+    return jnp.where(outside, sine2 / (1 + jnp.sqrt(1 - sine2)), 2)

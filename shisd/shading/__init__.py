@@ -12,4 +12,5 @@ from shisd.shading._polygon import shade_portal as shade_portal
 from shisd.shading._prefiltered import PrefilteredLobes as PrefilteredLobes
 from shisd.shading._prefiltered import prefilter as prefilter
 from shisd.shading._prefiltered import shade_prefiltered as shade_prefiltered
+from shisd.shading._sphere import shade_sphere as shade_sphere
 from shisd.shading._zonal import shade_zonal as shade_zonal
