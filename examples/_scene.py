@@ -10,12 +10,18 @@ import numpy as np
 
 @dataclass
 class View:
-    """The pixels of a square picture: rays for all of them, and normals and views [N, 3] where the object is seen."""
+    """The pixels of a square picture: rays for all of them, and normals and views [N, 3] where the object is seen.
+
+    Of meshes also the positions [N, 3], the triangles [N] that are seen, and where in them [N, 3].
+    """
 
     rays: np.ndarray  # [size, size, 3], unit, from the camera
     seen: np.ndarray  # [size, size], bool
     normals: np.ndarray
     views: np.ndarray
+    positions: np.ndarray | None = None
+    triangle: np.ndarray | None = None
+    weights: np.ndarray | None = None
 
     def picture(self, values: np.ndarray, background: np.ndarray | float = 0.0) -> np.ndarray:
         """[size, size, 3] from the values [N, 3] of the seen pixels."""
@@ -72,13 +78,21 @@ def sphere(size: int, azimuth: float) -> View:
     return _view(rays, seen, points[seen])
 
 
-def mesh(path: Path, size: int, azimuth: float) -> View:
-    """A mesh that was modelled with +y up, turned to +z up, with smooth normals."""
+def load_mesh(path: Path):
+    """A mesh that was modelled with +y up, turned to +z up, its middle at the origin."""
     import trimesh
 
     shape = trimesh.load_mesh(path)
     shape.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     shape.apply_translation(-shape.bounds.mean(axis=0))
+    return shape
+
+
+def mesh(path: Path, size: int, azimuth: float) -> View:
+    """A mesh as `load_mesh` turns it, with smooth normals."""
+    import trimesh
+
+    shape = load_mesh(path)
     eye = 4.4 * np.array([np.cos(azimuth), np.sin(azimuth), 0.25])
     rays = camera_rays(size, eye, np.zeros(3), np.radians(29))
     flat = rays.reshape(-1, 3)
@@ -89,4 +103,6 @@ def mesh(path: Path, size: int, azimuth: float) -> View:
     normals = unit(np.einsum("nk,nkx->nx", weights, shape.vertex_normals[shape.faces[face]]))
     seen = np.zeros(len(flat), bool)
     seen[ray] = True
-    return _view(rays, seen.reshape(size, size), normals)
+    view = _view(rays, seen.reshape(size, size), normals)
+    view.positions, view.triangle, view.weights = points, face, weights.astype(np.float32)
+    return view

@@ -13,4 +13,6 @@ from shisd.shading._prefiltered import PrefilteredLobes as PrefilteredLobes
 from shisd.shading._prefiltered import prefilter as prefilter
 from shisd.shading._prefiltered import shade_prefiltered as shade_prefiltered
 from shisd.shading._sphere import shade_sphere as shade_sphere
+from shisd.shading._visibility import shade_environment_visibility as shade_environment_visibility
+from shisd.shading._visibility import visibility_gamma as visibility_gamma
 from shisd.shading._zonal import shade_zonal as shade_zonal

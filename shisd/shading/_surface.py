@@ -47,17 +47,17 @@ def surface(
     return jax.tree.map(cast, lobes), jax.tree.map(cast, arrays), colour
 
 
-def shade_points(points: dict[str, Float[Array, "*_ 3"]], shade: Callable[..., Array], *arguments: Any) -> Array:
-    """`shade(points, *arguments)`, which takes flat points [p, 3]; instead of p, the result has their batch axes."""
-    shape = np.broadcast_shapes(*(a.shape for a in points.values()))
-    flat = {name: jnp.broadcast_to(a, shape).reshape(-1, 3) for name, a in points.items()}
+def shade_points(points: dict[str, Array], shade: Callable[..., Array], *arguments: Any) -> Array:
+    """`shade(points, *arguments)`, which takes flat points [p, k]; instead of p, the result has their batch axes."""
+    shape = np.broadcast_shapes(*(a.shape[:-1] for a in points.values()))
+    flat = {name: jnp.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for name, a in points.items()}
     values = shade(flat, *arguments)
-    return values.reshape(*shape[:-1], *values.shape[1:])
+    return values.reshape(*shape, *values.shape[1:])
 
 
 def shade_tiles(
     lobes: Lobes,
-    points: dict[str, Float[Array, "p 3"]],
+    points: dict[str, Array],
     colour: Shape,
     size: int,
     radiance: Callable[..., Float[Array, "*colour p"]],
@@ -80,15 +80,17 @@ def shade_tiles(
     return in_tiles(shade_tile, points, size)
 
 
-def in_tiles(function: Callable[[dict[str, Array]], Array], rows: dict[str, Float[Array, "p 3"]], size: int) -> Array:
+def in_tiles(function: Callable[[dict[str, Array]], Array], rows: dict[str, Array], size: int) -> Array:
     """function(rows) for at most `size` rows at a time, all tiles alike; the backward pass makes each tile again."""
     count = len(next(iter(rows.values())))
     if count == 0:
-        one = jax.eval_shape(function, {name: jax.ShapeDtypeStruct((1, 3), a.dtype) for name, a in rows.items()})
+        first = {name: jax.ShapeDtypeStruct((1, *a.shape[1:]), a.dtype) for name, a in rows.items()}
+        one = jax.eval_shape(function, first)
         return jnp.zeros((0, *one.shape[1:]), one.dtype)
     tiles = -(-count // size)
     size = min(count, size, -(-count // (tiles * _LANES)) * _LANES)  # of equal size, for little to fill up
-    fill = lambda a: jnp.concatenate([a, jnp.broadcast_to(a[-1:], (tiles * size - count, 3))]).reshape(tiles, size, 3)
+    more = tiles * size - count
+    fill = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]).reshape(tiles, size, -1)
     values = jax.lax.map(jax.checkpoint(function), {name: fill(a) for name, a in rows.items()})
     return values.reshape(tiles * size, *values.shape[2:])[:count]
 
