@@ -22,6 +22,7 @@ from shisd._typing import Array, Float
 from shisd.models import AbstractBrdf, Environment
 
 Radiance = ArrayLike | Callable[[Array], Array]
+Visible = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class Estimate(eqx.Module):
@@ -40,12 +41,16 @@ def shade_environment(
     key: Array,
     samples: int = 1024,
     tangents: ArrayLike | None = None,
+    positions: ArrayLike | None = None,
+    visible: Visible | None = None,
 ) -> Estimate:
     """Radiance [N, *colour] leaving N points towards their views under a distant environment, by Monte Carlo.
 
     Arguments: world `normals` and `views` [N, 3], made unit here, both away from the surface; `tangents` [N, 3] set the
     local x axis of anisotropic BRDFs (made orthogonal to the normal); static `samples` per point, rounded up so that
-    they fill whole cells. A view below the horizon gives 0.
+    they fill whole cells. A view below the horizon gives 0. With occlusion: `positions` [N, 3], where rays start, and
+    `visible`, a function on the host of NumPy arrays, starts [M, 3] and directions [M, 3], that says for each ray
+    whether it leaves the scene [M] (for trimesh: lambda p, w: ~mesh.ray.intersects_any(p, w)).
     Method: of eight samples, six follow the map's power, one the cosine, and one GGX half vectors as wide as
     `brdf.lobe_width`, each two to a cell of a stratified unit square. All are weighed by the balance heuristic, so the
     result is unbiased for any BRDF.
@@ -55,8 +60,12 @@ def shade_environment(
     """
     samples = _checks.integer("samples", samples, minimum=1)
     frames, local_views = _frames(normals, views, tangents, brdf)
-    count = -(-samples // 16)
-    return _monte_carlo(brdf, environment, frames, local_views, key, count)
+    if (positions is None) != (visible is None):
+        raise ValueError("`positions` and `visible` belong together; pass both for occlusion.")
+    starts = jnp.zeros_like(local_views) if positions is None else _checks.vectors("positions", positions)
+    if starts.shape != local_views.shape:
+        raise ValueError(f"`positions` must have the shape of `normals`, [N, 3]; got {list(starts.shape)}.")
+    return _monte_carlo(brdf, environment, frames, local_views, starts, visible, key, -(-samples // 16))
 
 
 def shade_environment_quadrature(
@@ -282,7 +291,14 @@ def _ggx_density(wi: Array, wo: Array, alpha: Array) -> Array:
 
 @eqx.filter_jit
 def _monte_carlo(
-    brdf: AbstractBrdf, environment: Environment, frames: Array, views: Array, key: Array, count: int
+    brdf: AbstractBrdf,
+    environment: Environment,
+    frames: Array,
+    views: Array,
+    starts: Array,
+    visible: Visible | None,
+    key: Array,
+    count: int,
 ) -> Estimate:
     """At least `count` pairs of samples that follow the cosine, `count` of half vectors, six times that of the map."""
     light = _map_density(environment)
@@ -293,8 +309,8 @@ def _monte_carlo(
     splits = np.cumsum(cells)[:-1]
     sizes = [2.0 * n for n in cells]
 
-    def one(point: tuple[Array, Array, Array]) -> tuple[Array, Array]:  # barriers stop XLA from repeating work
-        frame, wo, key = point
+    def one(point: tuple[Array, ...]) -> tuple[Array, Array]:  # barriers stop XLA from repeating work
+        frame, wo, start, key = point
         jitter = jax.random.uniform(key, (2, sum(cells), 2), views.dtype)  # two independent points in every cell
         u = jax.lax.optimization_barrier(corners + widths * jitter)
         u_light, u_cosine, u_ggx = jnp.split(u, splits, axis=1)
@@ -304,12 +320,26 @@ def _monte_carlo(
         density = sizes[0] * light(wi @ frame) + sizes[1] / np.pi * jnp.maximum(wi[..., 2], 0)
         density += sizes[2] * _ggx_density(wi, wo, alpha)
         inverse = jnp.where(density > 0, 1 / jnp.where(density > 0, density, jnp.ones_like(density)), 0)
+        if visible is not None:
+            inverse = jnp.where(_leaves(visible, start, wi @ frame), inverse, 0)
         terms = _times(inverse, _integrand(brdf, environment.radiance, frame, wo, wi), 2)
         value = jnp.sum(terms, axis=(0, 1))
         return value, jnp.sqrt(jnp.sum((terms[0] - terms[1]) ** 2, axis=0))
 
     keys = jax.random.split(key, views.shape[0])
-    return Estimate(*_tiled(one, (frames, views, keys), max(1, 2**15 // (2 * sum(cells)))))
+    return Estimate(*_tiled(one, (frames, views, starts, keys), max(1, 2**15 // (2 * sum(cells)))))
+
+
+def _leaves(visible: Visible, start: Float[Array, "3"], directions: Float[Array, "*batch 3"]) -> Array:
+    """`visible` of rays from one point, [...]; of many points in one call."""
+
+    def host(starts: ArrayLike, directions: ArrayLike) -> np.ndarray:
+        rays = (np.asarray(x, float).reshape(-1, 3) for x in (starts, directions))
+        return np.asarray(visible(*rays), bool).reshape(np.shape(directions)[:-1])
+
+    shape = jax.ShapeDtypeStruct(directions.shape[:-1], bool)
+    starts = jnp.broadcast_to(start, directions.shape)
+    return jax.pure_callback(host, shape, starts, directions, vmap_method="broadcast_all")
 
 
 def _tiled(function: Callable, arguments: tuple[Array, ...], size: int) -> tuple[Array, ...]:

@@ -230,3 +230,16 @@ def test_polygons_seen_from_behind_are_dark(rng):
     ):
         np.testing.assert_array_equal(shade(), 0)
         assert np.any(np.asarray(shade(two_sided=True)) > 0)
+
+
+def test_rays_that_are_stopped_bring_nothing(rng):
+    normals = np.tile(np.array([0, 0, 1], "float32"), (3, 1))
+    positions = np.array([[0, 0, 0], [5, 0, 0], [9, 0, 0]], "float32")
+    visible = lambda p, w: (p[:, 0] < 1) | ((p[:, 0] < 6) & (w[:, 0] > 0))  # all, half of them, none
+    sky = models.Environment(jnp.full((8, 16, 3), 2.0))
+    where = {"positions": positions, "visible": visible, "key": jax.random.key(3), "samples": 2048}
+    got = reference.shade_environment(models.Lambertian(0.5), sky, normals, normals, **where)
+    np.testing.assert_allclose(got.value[:, 0], [1.0, 0.5, 0.0], atol=0.01)
+    assert np.all(np.abs(got.value[1] - 0.5) < 4 * got.standard_error[1]) and np.all(got.standard_error[2] == 0)
+    with pytest.raises(ValueError, match="`positions` and `visible` belong together"):
+        reference.shade_environment(models.Lambertian(0.5), sky, normals, normals, key=where["key"], visible=visible)
