@@ -31,19 +31,27 @@ def shade_zonal(
     """Radiance that leaves surface points towards the viewer under distant light that is symmetric about an axis.
 
     Arguments: `lobes` from `tabulate_brdf`; `axis` [3] in world space, of any length but zero; `zonal_coefficients`
-    [*colour, L+1], those of y_l^0 about it; the others and what is returned as in `shade_environment`.
+    [*colour, L+1], those of y_l^0 about it (those of usual profiles: `decomposition.CapKernel`, `GaussianKernel`, ...,
+    `.zonal`); for S lights [S, 3] and [S, *colour, L+1]; the others and what is returned as in `shade_environment`.
+    For one material under the same lights at very many points, `prefilter` makes reflection maps of them.
     Derivatives: in every floating argument, both modes, any order.
     Accuracy: that of `shade_environment` with the same light.
-    Cost: (L+1)^2 harmonics per pixel where `shade_environment` rotates, about L^3 products.
-    Source: ISD15 Eq. 4 and 22, for a light that is one rotated zonal function.
+    Cost: (L+1)^2 harmonics per pixel and light where `shade_environment` rotates, about L^3 products.
+    Source: ISD15 Eq. 23 and 24.
     """
     check_lobes(lobes, everywhere=True)
     a, z = _checks.vectors("axis", axis), _checks.real_array("zonal_coefficients", zonal_coefficients)
-    if a.ndim != 1:
-        raise ValueError(f"`axis` must have shape [3]; got {list(a.shape)}.")
-    if z.ndim not in (1, 2) or z.shape[-1] == 0:
-        raise ValueError(f"`zonal_coefficients` must have shape [L+1] or [colour, L+1]; got {list(z.shape)}.")
-    light = [("zonal_coefficients", z.shape[:-1])]
+    if a.ndim > 2 or 0 in a.shape:
+        raise ValueError(f"`axis` must have shape [3], or [S, 3] for S lights; got {list(a.shape)}.")
+    lights = a.shape[:-1]
+    if z.ndim - len(lights) not in (1, 2) or z.shape[-1] == 0 or z.shape[: len(lights)] != lights:
+        lead = "".join(f"{n}, " for n in lights)
+        raise ValueError(
+            f"`zonal_coefficients` must have shape [{lead}L+1] or [{lead}colour, L+1]; got {list(z.shape)}."
+        )
+    if not lights:
+        a, z = a[None], z[None]
+    light = [("zonal_coefficients", z.shape[1:-1])]
     lobes, points, colour = surface(lobes, tangents, light, [a.dtype, z.dtype], normals=normals, views=views)
     dtype = lobes.weights.dtype
     z = z[..., : lobes.degree + 1].astype(dtype)
@@ -54,8 +62,8 @@ def shade_zonal(
 def _shade(
     points: dict[str, Float[Array, "p 3"]],
     lobes: Lobes,
-    axis: Float[Array, "3"],
-    z: Float[Array, "*c l"],
+    axes: Float[Array, "s 3"],
+    z: Float[Array, "s *c l"],
     colour: tuple[int, ...],
 ) -> Float[Array, " p *colour"]:
     degree = z.shape[-1] - 1
@@ -66,7 +74,8 @@ def _shade(
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
         slices = slice_values(table, local, lobes)
-        y = sh_basis(jnp.einsum("pij,i->pj", frame, axis), degree).T
-        return jnp.sum(times(slices, times(z[..., None], y)), axis=-2)
+        along = [sh_basis(jnp.einsum("pij,i->pj", frame, axis), degree).T for axis in axes]
+        light = sum(times(own[..., None], y) for own, y in zip(z, along, strict=True))
+        return jnp.sum(times(slices, light), axis=-2)
 
     return shade_tiles(lobes, points, colour, 1024, radiance)

@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 from shisd import decomposition, harmonics, models, shading
 from tests.hard_cases import unit
 from tests.marks import FLOAT32_FIRST
+from tests.shading.lobes import random_lobes
 
 DEGREE = 5
 MATERIALS = {"glossy": models.Ggx(0.4, 0.3), "brushed": models.Ggx(np.float32([0.3, 0.6]), np.float32([0.9, 0.6, 0.3]))}
@@ -47,6 +48,32 @@ def test_it_is_the_light_of_these_coefficients(material, dtype, rng):
     )
 
 
+def test_several_lights_add_up(dtype, rng):
+    lobes = random_lobes(DEGREE, dtype)
+    axis, z, normals, views, _ = scene(rng, 20, dtype)
+    axes, each = np.stack([axis, -axis[::-1]]), np.stack([z, z[::-1]])
+    got = shading.shade_zonal(lobes, axes, each, normals, views)
+    expected = sum(np.asarray(shading.shade_zonal(lobes, a, c, normals, views)) for a, c in zip(axes, each, strict=True))
+    np.testing.assert_allclose(got, expected, atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)))
+
+
+def test_eq_24_and_reflection_maps(x64, rng):
+    lobes = random_lobes(DEGREE, np.float64)
+    axis, z, normals, views, _ = scene(rng, 6, np.float64)
+    got = shading.shade_zonal(lobes, axis, z[0], normals, views)
+    # the sum over rotated axes as it stands: view in the x-z plane of each frame, z_l times Legendre series
+    for normal, view, value in zip(normals, views, got, strict=True):
+        x = unit(view - (view @ normal) * normal)
+        world = lobes.basis.directions @ np.stack([x, np.cross(normal, x), normal])
+        p = np.polynomial.legendre.legvander(np.asarray(world) @ unit(axis), DEGREE)  # y_l^0 pi_l = P_l
+        weights = lobes.slice_weights(jnp.array([np.sqrt(1 - (view @ normal) ** 2), 0, view @ normal]))
+        np.testing.assert_allclose(value, np.sum(np.asarray(weights) * z[0][:, None] * p.T), rtol=1e-9)
+    e = harmonics.convolve(harmonics.sh_basis(axis, DEGREE), z[0])
+    maps = shading.prefilter(lobes, e, tolerance=1e-3)
+    error = np.asarray(shading.shade_prefiltered(maps, normals, views)) - got
+    assert np.sqrt(np.mean(error**2)) < 5e-3 * np.sqrt(np.mean(np.square(got)))
+
+
 def test_derivatives(x64, rng):
     lobes = tabulate(MATERIALS["glossy"])
     arguments = tuple(jnp.asarray(a) for a in scene(rng, 3, np.float64)[:4])
@@ -57,9 +84,11 @@ def test_derivatives(x64, rng):
 def test_errors_name_the_argument(as_user, rng):
     axis, z, normals, views, _ = scene(rng, 2, np.float32)
     lobes = tabulate(MATERIALS["glossy"])
-    with pytest.raises(ValueError, match=r"`axis` must have shape \[3\]; got \[1, 3\]"):
-        shading.shade_zonal(lobes, axis[None], z, normals, views)
-    with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape"):
+    with pytest.raises(ValueError, match=r"`axis` must have shape \[3\], or \[S, 3\] for S lights; got \[1, 1, 3\]"):
+        shading.shade_zonal(lobes, axis[None, None], z, normals, views)
+    with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape \[L\+1\]"):
         shading.shade_zonal(lobes, axis, z[None], normals, views)
+    with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape \[1, L\+1\] or \[1, colour, L\+1\]"):
+        shading.shade_zonal(lobes, axis[None], z[0], normals, views)
     with pytest.raises(ValueError, match="`lobes` must come from shading.tabulate_brdf"):
         shading.shade_zonal(1, axis, z, normals, views)
