@@ -5,9 +5,9 @@ With v = visibility in the frame of the world, E = light and c = the slice turne
     I = integral of v E (R c) = sum over j of u_j (R c)_j,   u_j = integral of v E y_j = sum over i of M_ij v_i,
 
 where M is the matrix of products with E, exact. The paper takes the same steps in another order: it multiplies every
-pixel's slice by gamma, the weights of E y_j on rotated zonal harmonics, and looks up v at their axes, which turns no
-expansion either. But M and interpolation commute. So M meets each vertex once, which is what the pixels between them
-interpolate, and a pixel turns its slice: of all factors that with the fewest colours.
+pixel's slice by gamma, the weights of E y_j on rotated zonal harmonics, and looks up v at their axes. But M and
+interpolation commute. So M meets each vertex once, where these are fewer than the pixels, and a pixel turns its slice:
+of all factors that with the fewest colours.
 
 notation: u = coefficients of the visible light at each vertex; R = (t, b, n) local to world.
 """
@@ -108,18 +108,23 @@ def _shade(
     own = points["visibility"] if v is None else v
     product = _products(e, degree, _checks.degree_of(own.shape[-1])).reshape(-1, table.shape[-2], own.shape[-1])
     to_visible = lambda v: jnp.einsum("cij,vj->vci", product, v)
-    visible = None if v is None else to_visible(v)
+    shared = v is not None and ("corners" not in points or len(v) < len(points["normals"]))
+    rows = to_visible(v) if shared else v
+
+    def visible_light(at: dict[str, Array]) -> Float[Array, "p c n"]:
+        if rows is None:
+            return to_visible(at["visibility"])
+        if not at:
+            return rows
+        weight = lambda i: at["weights"][:, i].reshape(-1, *(1,) * (rows.ndim - 1))
+        between = sum(weight(i) * rows[at["corners"][:, i]] for i in range(3))
+        return between if shared else to_visible(between)
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], **at: Array) -> Float[Array, "*colour p"]:
         slices = slice_values(table, local, lobes)
         slices = rotate_many(jnp.moveaxis(slices.reshape(-1, *slices.shape[-2:]), 0, 1), frame, degree)
         slices = jnp.moveaxis(slices, 1, 0)  # colour, n, p
-        if visible is None:
-            u = to_visible(at["visibility"])
-        elif at:
-            u = sum(at["weights"][:, i, None, None] * visible[at["corners"][:, i]] for i in range(3))
-        else:
-            u = visible
+        u = visible_light(at)
         u = jnp.broadcast_to(jnp.moveaxis(u, 0, -1), (*u.shape[1:], len(local)))
         return jnp.broadcast_to(jnp.sum(slices * u, axis=1).reshape(*colour, -1), (*colour, len(local)))
 
