@@ -30,6 +30,15 @@ _DEGREES_TOGETHER = 4  # more make fewer and larger products, with more zeros in
 Parts = tuple[Array, ...]  # xa, ya, xb, yb
 Bands = dict[int, np.ndarray]  # by offset, diagonals [degrees, to] of matrices that join neighbouring orders
 Series = tuple[Array, ...]  # of even, then of odd multiples of g
+
+
+class Each(NamedTuple):
+    """Expansions c, one set of colours for every rotation, as s is given: m >= 0 and m < 0, [rows, colours, p]."""
+
+    x: Array
+    y: Array
+
+
 Waves = list[Array]  # cosines and sines [L+1, p] of the multiples of an angle
 
 
@@ -123,12 +132,13 @@ def turned_series(c: Float[Array, "f n"], degree: int) -> Series:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
 def pair_many(
-    x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], series: Series, r: Float[Array, "p 3 3"],
+    x: Float[Array, "rows f p"], y: Float[Array, "rows f p"], series: Series | Each, r: Float[Array, "p 3 3"],
     degree: int, upright: bool = False,
 ) -> Float[Array, "f3 p"]:  # fmt: skip
     """sum over n of s_n (R c)_n, for an s of every rotation, ordered as `rows` says, and `turned_series` of a c.
 
-    Of the numbers of colours of s and c one may be 1. `upright` promises that R z has y = 0 <= x.
+    Instead of the series of a c that all share, `Each` has one for every rotation; then s takes all turns, as it has the
+    fewest colours. Of the numbers of colours of s and c one may be 1. `upright` promises that R z has y = 0 <= x.
     Derivatives: exact wherever the pole stays in place, to every order.
     """
     a, b, g = turns(r, max(degree, 1))
@@ -147,7 +157,7 @@ def _pair_many_jvp(degree, upright, primals, tangents):
             moved = [tuple(p + q for p, q in zip(s, t, strict=True)) for s, t in zip(moved, turning, strict=True)]
         change += _pair_away_from_pole(moved, series, r, degree)
     if not all(isinstance(t, SymbolicZero) for t in d_series):
-        d_series = tuple(zero(d, m) for d, m in zip(d_series, series, strict=True))
+        d_series = jax.tree.map(zero, d_series, series, is_leaf=lambda t: isinstance(t, SymbolicZero))
         change += _pair_away_from_pole(lobe, d_series, r, degree)
     return value, change
 
@@ -155,7 +165,7 @@ def _pair_many_jvp(degree, upright, primals, tangents):
 pair_many.defjvp(_pair_many_jvp, symbolic_zeros=True)
 
 
-def _pair_away_from_pole(s: list[Parts], series: Series, r: Float[Array, "p 3 3"], degree: int) -> Array:
+def _pair_away_from_pole(s: list[Parts], series: Series | Each, r: Float[Array, "p 3 3"], degree: int) -> Array:
     """`pair_many` with smooth angles: where R nearly keeps the z axis, s . R c = Q s . Q R c with Q, a quarter turn."""
     near = r[:, 2, 2] ** 2 > 1 - _NEAR**2
 
@@ -170,11 +180,17 @@ def _pair_away_from_pole(s: list[Parts], series: Series, r: Float[Array, "p 3 3"
     return _pair(s, series, a, b, g, degree)  # of upright rotations a = 0, but its derivative is not
 
 
-def _pair(s: list[Parts], series: Series, a: Waves | None, b: Waves, g: Waves, degree: int) -> Float[Array, "f3 p"]:
-    """(Z(b) J Z(-a) s) . (J Z(g) c)."""
+def _pair(
+    s: list[Parts], series: Series | Each, a: Waves | None, b: Waves, g: Waves, degree: int
+) -> Float[Array, "f3 p"]:
+    """(Z(b) J Z(-a) s) . (J Z(g) c), or (Z(-g) J Z(b) J Z(-a) s) . c."""
     if a is not None:
         s = _turned(s, a[0], -a[1], degree)
     s = _turned(_swapped(s, degree), b[0], b[1], degree)
+    if isinstance(series, Each):
+        s = _turned(_swapped(s, degree), g[0], -g[1], degree)
+        products = [p * q for both in zip(s, _split(*series, degree), strict=True) for p, q in zip(*both, strict=True)]
+        return functools.reduce(jnp.add, [jnp.sum(p, axis=(0, 1)) for p in products])
     totals = []
     for k, matrices in enumerate(series):
         kept = [parts[i + (block.a[0] != k)] for block, parts in zip(_blocks(degree), s, strict=True) for i in (0, 2)]
