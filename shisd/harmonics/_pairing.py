@@ -137,8 +137,8 @@ def pair_many(
 ) -> Float[Array, "f3 p"]:  # fmt: skip
     """sum over n of s_n (R c)_n, for an s of every rotation, ordered as `rows` says, and `turned_series` of a c.
 
-    Instead of the series of a c that all share, `Each` has one for every rotation; then s takes all turns, as it has the
-    fewest colours. Of the numbers of colours of s and c one may be 1. `upright` promises that R z has y = 0 <= x.
+    Instead of the series of a c that all share, `Each` has one for every rotation; then s takes all turns, for it has
+    the fewest colours. Of the numbers of colours of s and c one may be 1. `upright` promises that R z has y = 0 <= x.
     Derivatives: exact wherever the pole stays in place, to every order.
     """
     a, b, g = turns(r, max(degree, 1))

@@ -4,8 +4,14 @@ Directions are in world space and point away from the surface; image colour is t
 """
 
 from shisd.shading._environment import shade_environment as shade_environment
+from shisd.shading._footprint import MirrorFootprint as MirrorFootprint
+from shisd.shading._footprint import mirror_footprint as mirror_footprint
 from shisd.shading._lobes import Lobes as Lobes
 from shisd.shading._lobes import tabulate_brdf as tabulate_brdf
+from shisd.shading._mirror import MirrorMaps as MirrorMaps
+from shisd.shading._mirror import prefilter_mirror as prefilter_mirror
+from shisd.shading._mirror import shade_mirror as shade_mirror
+from shisd.shading._mirror import shade_prefiltered_mirror as shade_prefiltered_mirror
 from shisd.shading._polygon import project_light as project_light
 from shisd.shading._polygon import shade_polygon as shade_polygon
 from shisd.shading._polygon import shade_portal as shade_portal
