@@ -9,7 +9,7 @@ a = the unit vector at r that points up, b = horizontal; w is above the horizon 
 
 import functools
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from shisd.harmonics._sh import weighted_sums
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 
+Pytree = TypeVar("Pytree")
 RIDGE = 1e-6  # of fits above the horizon
 
 
@@ -115,7 +116,20 @@ def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p
 
 def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:
     """`slice_values` in the order of `harmonics._pairing`, m >= 0 and m < 0 apart: two arrays [rows, colours, p]."""
-    table = lookup_table(lobes, degree)
+    waves = _views.azimuth_factors if lobes.isotropic else None
+    return products_in_order(lookup_table(lobes, degree), degree, lambda view: lookup_factors(view, lobes), waves)
+
+
+def products_in_order(
+    table: Float[Array, "*colour n columns"],
+    degree: int,
+    factors: Callable[[Float[Array, "p 3"]], Float[Array, "columns p"]],
+    waves: Callable[[Float[Array, "p 3"], int], tuple[Array, Array]] | None,
+) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:
+    """table @ factors(view) in the order of `harmonics._pairing`: two arrays [rows, colours, p] for every view.
+
+    Of isotropic materials only rows m >= 0, at azimuth 0; `waves(view, L+1)` are the cosines and sines for the others.
+    """
     table = jnp.pad(table.reshape(-1, *table.shape[-2:]), ((0, 0), (0, 1), (0, 0)))
     *signs, k = rows(degree)
     plus, minus = (jnp.swapaxes(table[:, index], 0, 1) for index in signs)
@@ -126,12 +140,12 @@ def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], t
         return (flat @ factors).reshape(*table.shape[:2], -1)
 
     def look_up(view: Float[Array, "p 3"]) -> tuple[Array, Array]:
-        factors = lookup_factors(view, lobes)
-        x = product(plus, factors)
-        if not lobes.isotropic:
-            return x, product(minus, factors)
+        columns = factors(view)
+        x = product(plus, columns)
+        if waves is None:
+            return x, product(minus, columns)
         # a product with a 0-1 matrix, whose transpose is one too: that of an indexed copy would be slow
-        cos, sin = ((spread @ f)[:, None] for f in _views.azimuth_factors(view, max(degree, 1) + 1))
+        cos, sin = ((spread @ f)[:, None] for f in waves(view, max(degree, 1) + 1))
         return cos * x, sin * x
 
     return look_up
@@ -204,22 +218,38 @@ def _decompose(
     domain: Literal["sphere", "upper"],
 ) -> Lobes:
     """What may refuse, apart from what takes long to compile: JAX does not store compiled code that can raise."""
-    if tolerance is not None:
-        c = eqx.error_if(
-            c,
-            ~(error <= tolerance),
-            "The quadrature does not resolve this material: a coarser rule differs by more than `tolerance`. "
-            "Pass a larger `quadrature`, or throw=False and read `quadrature_error`.",
-        )
-    return Lobes(basis, basis.weights(c), error, isotropic, domain)
+    return Lobes(basis, basis.weights(resolved(c, error, tolerance)), error, isotropic, domain)
+
+
+def resolved(values: Pytree, error: Scalar, tolerance: float | None) -> Pytree:
+    """The same, or an error at run time where the quadrature's error passes the tolerance."""
+    if tolerance is None:
+        return values
+    return eqx.error_if(
+        values,
+        ~(error <= tolerance),
+        "The quadrature does not resolve this material: a coarser rule differs by more than `tolerance`. "
+        "Pass a larger `quadrature`, or throw=False and read `quadrature_error`.",
+    )
 
 
 @eqx.filter_jit
 def _slices(
     brdf: AbstractBrdf, degree: int, dtype: DTypeLike, views: int, azimuths: int, quadrature: int, ridge: float | None
 ) -> tuple[Float[Array, "*colour_views n"], Scalar]:
-    """SH coefficients of the slices, and the quadrature's error."""
-    theta = _views.elevations(views)
+    return slices_at(_views.elevations(views), brdf, degree, dtype, azimuths, quadrature, ridge)
+
+
+def slices_at(
+    theta: np.ndarray,
+    brdf: AbstractBrdf,
+    degree: int,
+    dtype: DTypeLike,
+    azimuths: int,
+    quadrature: int,
+    ridge: float | None,
+) -> tuple[Float[Array, "*colour_views n"], Scalar]:
+    """SH coefficients of the slices at elevations `theta` of the view, and the quadrature's error."""
     phi = np.zeros(1) if brdf.isotropic else 2 * np.pi * np.arange(azimuths) / azimuths
     theta, phi = np.meshgrid(theta, phi, indexing="ij")
     local = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
