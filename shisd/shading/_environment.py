@@ -39,8 +39,9 @@ def shade_environment(
     its part along the surface counts). Colours of lobes and light broadcast: scalar or RGB. Bands that only one of the
     two has add nothing. Returns [..., *colour] in W/(m2 sr), or the light's unit. A view below the horizon gives 0; a
     zero or NaN normal or view gives NaN.
-    Derivatives: in every floating argument, both modes, any order; smooth where a view lies along its normal and where
-    a normal lies along any axis of the world. The cut at the horizon is a discontinuity of the view, with no gradient.
+    Derivatives: in every floating argument, both modes, any order, also where a normal lies along an axis of the world;
+    where a view lies along its normal, the first. The cut at the horizon is a discontinuity of the view, with no
+    gradient.
     Accuracy: Eq. 22 to 1e-5 in float32 and 1e-12 in float64, relative to the largest radiance.
     Cost: about L^3 products per pixel. Memory: one tile of at most 4096 pixels, about 3 MB per array, and the
     result; the same with gradients.

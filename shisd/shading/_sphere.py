@@ -41,7 +41,8 @@ def shade_sphere(
     below the horizon of a point adds nothing, as far as the lobes' degree resolves the cosine's edge. A point inside a
     ball has its surface all around; a `radius` that is zero or negative gives NaN.
     Derivatives: in every floating argument: position, radius and emission of the lights, positions, material, frame;
-    both modes, any order, but those in position and radius go to infinity at the surface of a ball.
+    both modes, any order, where the view or a ball lie along the normal the first. Those in position and radius go to
+    infinity at the surface of a ball.
     Accuracy: exact for the tabulated slice, to 1e-12 in float64 and 1e-5 of the largest radiance in float32.
     Cost: (L+1)^2 harmonics for every light and point. Memory: one tile of 1024 points.
     """

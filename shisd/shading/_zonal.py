@@ -34,7 +34,7 @@ def shade_zonal(
     [*colour, L+1], those of y_l^0 about it (those of usual profiles: `decomposition.CapKernel`, `GaussianKernel`, ...,
     `.zonal`); for S lights [S, 3] and [S, *colour, L+1]; the others and what is returned as in `shade_environment`.
     For one material under the same lights at very many points, `prefilter` makes reflection maps of them.
-    Derivatives: in every floating argument, both modes, any order.
+    Derivatives: in every floating argument, both modes, any order; where view or axis lie along the normal, the first.
     Accuracy: that of `shade_environment` with the same light.
     Cost: (L+1)^2 harmonics per pixel and light where `shade_environment` rotates, about L^3 products.
     Source: ISD15 Eq. 23 and 24.
