@@ -69,6 +69,26 @@ def test_area_lights_writes_pictures_and_a_table(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "name, options",
+    [
+        ("visibility", ["--size", 40, "--samples", 256, "--rays", 512]),
+        ("mirror", ["--size", 32]),
+        ("denoise", ["--size", 32]),
+    ],
+)
+def test_applications_write_a_picture_and_a_table(name, options, tmp_path):
+    output = tmp_path / name
+    command = [ROOT / f"examples/{name}.py", "--output", output]
+    done = python(*command, *options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (output / f"{name}.md").read_text() in done.stdout
+    assert [path.name for path in output.glob("*.png")] == [f"{name}.png"]
+    refused = python(*command)
+    assert refused.returncode != 0 and "exists" in refused.stderr
+
+
+@pytest.mark.slow
 def test_many_devices_agree_with_one(tmp_path):
     """Simulated devices, and two processes that are started by the example."""
     output = tmp_path / "many_devices"

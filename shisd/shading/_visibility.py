@@ -113,7 +113,7 @@ def _shade(
         if v is None:
             seen = at["visibility"]
         elif "corners" in at:
-            seen = sum(at["weights"][:, i, None] * v[at["corners"][:, i]] for i in range(3))
+            seen = jnp.einsum("pc,pcn->pn", at["weights"], v[at["corners"]])
         else:
             seen = jnp.broadcast_to(v, (len(local), size))
         light = Each(*((m.reshape(-1, size) @ seen.T).reshape(*m.shape[:2], -1) for m in (plus, minus)))

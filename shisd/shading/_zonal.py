@@ -6,6 +6,8 @@ frame they are harmonics at the local direction of the axis: nothing is rotated.
 notation: a = axis; z_l = coefficients of the zonal light; pi_l = sqrt(4 pi/(2l+1)); R = (t, b, n) local to world.
 """
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -75,7 +77,7 @@ def _shade(
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
         slices = slice_values(table, local, lobes)
         along = [sh_basis(jnp.einsum("pij,i->pj", frame, axis), degree).T for axis in axes]
-        light = sum(times(own[..., None], y) for own, y in zip(z, along, strict=True))
-        return jnp.sum(times(slices, light), axis=-2)
+        light = [times(own[..., None], y) for own, y in zip(z, along, strict=True)]
+        return jnp.sum(times(slices, functools.reduce(jnp.add, light)), axis=-2)
 
     return shade_tiles(lobes, points, colour, 1024, radiance)
