@@ -7,7 +7,7 @@ RUN := $(VENV)/bin/python
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint report bench clean
+.PHONY: help demo test test-slow lint report applications bench clean
 
 help:
 	@echo "make demo       relight two objects with real maps; pictures and a table go to output/relight"
@@ -15,6 +15,7 @@ help:
 	@echo "make test-slow  the slow tests: examples, notebooks, convergence"
 	@echo "make lint       ruff and pyright"
 	@echo "make report     speed against error, beside other methods, to output/report; QUICK=1 for a few of them, README=1 also there"
+	@echo "make applications  the same for shadows, balls of light, mirrors, measurements, BRDF matrices"
 	@echo "make bench      studies behind the choices of the library: axes, kernels, recurrences, planning, stability"
 	@echo "make clean      remove .venv and output"
 
@@ -35,6 +36,9 @@ ALLOCATOR := MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=400000
 
 report: $(VENV)/.bench
 	$(ALLOCATOR) $(RUN) -m tests.bench.report $(if $(QUICK),--quick) $(if $(README),--readme)
+
+applications: $(VENV)/.test
+	$(ALLOCATOR) $(RUN) -m tests.bench.report --only applications $(if $(QUICK),--quick) $(if $(README),--readme)
 
 bench: $(VENV)/.test
 	$(ALLOCATOR) $(RUN) -m tests.bench.run --readme

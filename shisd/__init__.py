@@ -2,6 +2,7 @@
 
 from shisd import decomposition as decomposition
 from shisd import domains as domains
+from shisd import filtering as filtering
 from shisd import harmonics as harmonics
 from shisd import models as models
 from shisd import planning as planning

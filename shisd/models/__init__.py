@@ -16,5 +16,6 @@ from shisd.models._light import SphereLight as SphereLight
 from shisd.models._measured import MeasuredBrdf as MeasuredBrdf
 from shisd.models._microfacet_fits import AbcMicrofacet as AbcMicrofacet
 from shisd.models._microfacet_fits import SgdMicrofacet as SgdMicrofacet
+from shisd.models._projected import ProjectedBrdf as ProjectedBrdf
 from shisd.models._visibility import Visibility as Visibility
 from shisd.models._visibility import cap_visibility as cap_visibility

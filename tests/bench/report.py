@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from tests.bench import environments, harness, local_lights, renderers, roofline, spherical
+from tests.bench import applications, environments, harness, local_lights, renderers, roofline, spherical
 from tests.bench.run import paste, table
 
 GROUPS = {  # name: (title, tasks)
@@ -23,7 +23,8 @@ GROUPS = {  # name: (title, tasks)
     "spherical": ("Spherical harmonics", spherical.tasks),
     "renderers": ("Whole pictures", renderers.tasks),
 }
-TABLES = {"roofline": roofline.tables}
+TABLES = {"roofline": roofline.tables, "applications": applications.tables}
+APART = ("applications",)  # only when named: `make applications`
 
 
 def summary(panels: dict[str, list[dict]], item: str) -> list[dict]:
@@ -69,7 +70,7 @@ def main() -> None:
     parser.add_argument("--readme", action="store_true", help="put tables into README.md and figures into examples/")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
-    wanted = arguments.only or [*GROUPS, *TABLES]
+    wanted = arguments.only or [name for name in (*GROUPS, *TABLES) if name not in APART]
     allocator = "tuned" if os.environ.get("MALLOC_MMAP_MAX_") == "0" else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
     results, sections, start = {"machine": note, "rows": []}, {}, time.perf_counter()

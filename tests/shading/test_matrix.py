@@ -86,6 +86,7 @@ def test_elements_are_integrals_over_both_directions(kind, dtype):
         np.testing.assert_allclose(matrix @ above, elements, atol=bound)
 
 
+@pytest.mark.slow
 @FLOAT32_FIRST
 @pytest.mark.parametrize("domain", ["sphere", pytest.param("upper", marks=pytest.mark.slow)])
 def test_slices_are_those_of_the_table(domain, dtype):
@@ -141,6 +142,7 @@ def test_radiance_is_the_product_of_slice_and_light(kind, dtype, rng):
     np.testing.assert_allclose(got, expected, atol=(1e-5 if dtype == np.float32 else 1e-12) * np.max(np.abs(expected)))
 
 
+@pytest.mark.slow
 def test_matrix_and_table_shade_alike(rng):
     matrix = matrix_of("isotropic", SINGLE)
     light, normals, views, _ = scene(rng, 200, np.float32)
@@ -155,6 +157,7 @@ def test_matrix_and_table_shade_alike(rng):
     assert np.all(np.asarray(below) == 0)
 
 
+@pytest.mark.slow
 def test_derivatives(x64, rng):
     """In light, normals and views; the first view lies along its normal."""
     light, normals, views, _ = scene(rng, 2, np.float64)
@@ -174,6 +177,7 @@ def test_derivatives_in_the_material(x64):
     check_grads(jax.jit(first_block), (jnp.asarray(0.6),), order=1, atol=1e-6, rtol=1e-5, eps=1e-4)
 
 
+@pytest.mark.slow
 def test_lambertian(x64):
     """Bands of max(cos, 0) / pi in closed form (Ramamoorthi and Hanrahan 2001, Eq. 19); no degree of the view."""
     even = [2 * math.factorial(l) / ((l + 2) * (l - 1) * 2**l * math.factorial(l // 2) ** 2) for l in (2, 4, 6, 8)]

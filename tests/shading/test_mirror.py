@@ -277,6 +277,7 @@ def filter_of(r, e, anisotropic):
     ))  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("anisotropic", [False, True])
 def test_derivatives_of_filters(anisotropic, x64, rng):
     e, (r, axes) = jnp.asarray(light(rng, 2)), hard_footprints(rng)

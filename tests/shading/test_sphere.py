@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 from shisd import decomposition, models, shading
 from shisd.shading import _views
 from tests.hard_cases import ring, unit
+from tests.marks import FLOAT32_FIRST, FLOAT64_FIRST
 from tests.shading.lobes import random_lobes
 from tests.truth import scipy_basis
 
@@ -51,6 +52,7 @@ def test_zonal_coefficients_are_integrals_over_the_cap(dtype):
         np.testing.assert_allclose(row[1], 0.5 * expected, rtol=0, atol=0.5 * tolerance)
 
 
+@FLOAT64_FIRST
 def test_it_is_the_integral_of_the_slice_over_the_cap(dtype, rng):
     lobes = random_lobes(DEGREE, dtype)
     node = 5
@@ -70,6 +72,7 @@ def test_it_is_the_integral_of_the_slice_over_the_cap(dtype, rng):
         np.testing.assert_allclose(got, [3 * value, value], rtol=scale, err_msg=f"radius {radius}")
 
 
+@pytest.mark.slow
 def test_a_polygon_of_64_corners_is_nearly_a_ball(x64, rng):
     lobes = random_lobes(DEGREE, np.float64)
     center, angle, corners = np.array([0.4, -0.3, 2.0]), 0.3, 64
@@ -88,6 +91,8 @@ def test_a_polygon_of_64_corners_is_nearly_a_ball(x64, rng):
     np.testing.assert_allclose(ball, flat, rtol=1e-6)
 
 
+@pytest.mark.slow
+@FLOAT32_FIRST
 def test_several_balls_and_colours(dtype, rng):
     lobes = random_lobes(DEGREE, dtype, (3,))
     lights = [models.SphereLight(np.array([0.5, 0.2, 3.0], dtype), 0.5, np.array([3.0, 2.0, 1.0], dtype)),

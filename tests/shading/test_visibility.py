@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 from shisd import harmonics, models, shading
 from shisd.shading import _views
 from tests.hard_cases import unit
+from tests.marks import FLOAT32_FIRST
 from tests.shading.lobes import random_lobes
 from tests.truth import scipy_basis
 
@@ -39,6 +40,7 @@ def quadrature(c, e, v, frame):
     return (area * v * (scipy_basis(points @ frame, LOBES) @ c)) @ e
 
 
+@FLOAT32_FIRST
 def test_it_is_the_integral_of_the_three_expansions(dtype, rng):
     lobes = random_lobes(LOBES, dtype)
     e, seen, triangle, weights, frames = scene(rng, dtype)
@@ -56,6 +58,7 @@ def test_it_is_the_integral_of_the_three_expansions(dtype, rng):
     np.testing.assert_allclose(one[1], expected[1, 0], rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_the_triple_product_and_the_shader_of_the_paper_agree(x64, rng):
     lobes = random_lobes(LOBES, np.float64)
     e, seen, triangle, weights, frames = scene(rng, np.float64, count=2)
@@ -77,6 +80,8 @@ def test_the_triple_product_and_the_shader_of_the_paper_agree(x64, rng):
     np.testing.assert_allclose(got[0], jnp.einsum("clk,lk->c", s, seen_along), rtol=1e-10)
 
 
+@pytest.mark.slow
+@FLOAT32_FIRST
 def test_without_occlusion_it_is_the_environment(dtype, rng):
     lobes = random_lobes(LOBES, dtype, (3,))
     e, _, _, _, frames = scene(rng, dtype)
@@ -99,6 +104,7 @@ def test_caps_are_integrals_over_what_they_leave(dtype):
         np.testing.assert_allclose(row, p[l] * scipy_basis(axis, 8), atol=3e-6 if dtype == np.float32 else 1e-13)
 
 
+@pytest.mark.slow
 def test_derivatives(x64, rng):
     lobes = random_lobes(LOBES, np.float64)
     e, seen, triangle, weights, frames = scene(rng, np.float64, count=3)

@@ -48,6 +48,7 @@ def test_it_is_the_light_of_these_coefficients(material, dtype, rng):
     )
 
 
+@FLOAT32_FIRST
 def test_several_lights_add_up(dtype, rng):
     lobes = random_lobes(DEGREE, dtype)
     axis, z, normals, views, _ = scene(rng, 20, dtype)
