@@ -199,7 +199,7 @@ def _pairs(
 
 def _coverage(wi: Array, wo: Array, used: Array, degree: int, isotropic: bool) -> Scalar:
     """Share of probing pairs that have a used sample within pi / (2L+2) of both, exchanged or not."""
-    steps = 1.2 ** -np.arange(1, 5) if isotropic else 0.856674884 ** np.arange(1, 5)  # a low-discrepancy sequence
+    steps = 1.1673039783 ** -np.arange(1, 5)  # x^5 = x + 1: an additive sequence that fills four dimensions evenly
     u = (0.5 + np.arange(1, _PROBES + 1)[:, None] * steps) % 1
     polar, azimuth = np.arcsin(np.sqrt(u[:, :2])), 2 * np.pi * u[:, 2:]
     probes = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
@@ -321,7 +321,7 @@ def denoise_merl(
     if smoothness is None:
         smoothness, noise = _choose(log, count)
     z = [np.asarray(_smooth(y, w, smoothness), np.float64) for y, w in zip(log, count, strict=True)]
-    lowest, highest = (f(np.where(count > 0, log, log[count > 0].mean()), axis=(1, 2, 3)) for f in (np.min, np.max))
+    lowest, highest = (f(np.where(count > 0, log, np.nan), axis=(1, 2, 3)) for f in (np.nanmin, np.nanmax))
     smooth = np.maximum(np.exp(np.clip(np.stack(z, axis=-1), lowest, highest)) - dark, 0)
     smooth = np.concatenate([smooth, smooth[:, :, ::-1]], axis=2) if mirrored else smooth
     energy = _bin_energy()[..., None]
@@ -339,6 +339,8 @@ def _choose(log: np.ndarray, count: np.ndarray) -> tuple[float, float]:
     y = log.mean(axis=0)
     w = np.where(known, count.mean(axis=0), 0).astype(np.float32)
     out = known & (np.random.default_rng(0).random(known.shape) < 0.1)
+    if not out.any():
+        raise ValueError("`source` has too few bins that are valid in all colours to choose by; pass `smoothness`.")
     tries = (1.0, 10.0, 100.0, 1000.0)
     errors = [np.average((np.asarray(_smooth(y, np.where(out, 0, w), s)) - y)[out] ** 2, weights=w[out]) for s in tries]
     return tries[int(np.argmin(errors))], float(np.sqrt(np.min(errors)))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import decomposition, filtering, io, models, shading
+from shisd.models._measured import fill_nearest
 from tests.models.materials import GOLD_PAINT, NICKEL, array, evaluate, hemisphere_rule, pairs, spherical
 
 NOISE, HOLES, SAMPLES = 0.1, 0.5, 40000
@@ -44,7 +45,7 @@ def spoil(table: np.ndarray, seed: int = 0, *, noise: float = NOISE, holes: floa
 
 def measured(table: np.ndarray) -> models.MeasuredBrdf:
     """The table as it is, holes filled with the nearest value."""
-    filled = models._measured.fill_nearest(table, table >= 0)
+    filled = fill_nearest(table, table >= 0)
     return models.MeasuredBrdf(jnp.asarray(filled, np.float32))
 
 
