@@ -61,6 +61,7 @@ def test_it_is_the_dense_regularised_least_squares_solution(rng, x64):
     np.testing.assert_allclose(found.error, np.sqrt(w @ residual**2 / (w @ y**2)), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_missing_values_count_for_nothing(rng):
     wi, wo = (array(cosine_spread(rng, N), np.float32) for _ in range(2))
     y = array(rng.random((N, 3)), np.float32)
@@ -122,6 +123,7 @@ def test_factors_are_ratios_of_bessel_functions(dtype):
     np.testing.assert_allclose(got, expected, atol=1e-5 if dtype == np.float32 else 1e-12)
 
 
+@pytest.mark.slow
 def test_the_filter_is_the_mean_over_the_kernel(rng, x64):
     """ISD15's convolution by quadrature over both spheres, and the integral over them, which stays."""
     n, kappa = 9, 7.0
