@@ -30,6 +30,14 @@ class View:
         return image
 
 
+def output_parser(text: str, name: str) -> argparse.ArgumentParser:
+    """A parser that shows the text of a program, with the options that `prepare_output` is for."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("output") / name, help="folder for what is made")
+    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
+    return parser
+
+
 def prepare_output(folder: Path, overwrite: bool, mark: str, parser: argparse.ArgumentParser) -> None:
     """An empty folder. One that exists is replaced only when asked, and only if it holds `mark` or nothing."""
     if folder.exists():
@@ -88,20 +96,24 @@ def load_mesh(path: Path):
     return shape
 
 
-def mesh(path: Path, size: int, azimuth: float) -> View:
-    """A mesh as `load_mesh` turns it, with smooth normals."""
+def hits(shape, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of rays [N, 3] that meet a mesh: their indices, the points, the triangles, where in them, and smooth normals."""
     import trimesh
 
-    shape = load_mesh(path)
-    eye = 4.4 * np.array([np.cos(azimuth), np.sin(azimuth), 0.25])
-    rays = camera_rays(size, eye, np.zeros(3), np.radians(29))
-    flat = rays.reshape(-1, 3)
-    points, ray, face = shape.ray.intersects_location(np.broadcast_to(eye, flat.shape), flat, multiple_hits=False)
+    points, ray, face = shape.ray.intersects_location(np.broadcast_to(eye, rays.shape), rays, multiple_hits=False)
     order = np.argsort(ray)
     points, ray, face = points[order], ray[order], face[order]
     weights = trimesh.triangles.points_to_barycentric(shape.triangles[face], points)
     normals = unit(np.einsum("nk,nkx->nx", weights, shape.vertex_normals[shape.faces[face]]))
-    seen = np.zeros(len(flat), bool)
+    return ray, points, face, weights, normals
+
+
+def mesh(path: Path, size: int, azimuth: float) -> View:
+    """A mesh as `load_mesh` turns it, with smooth normals."""
+    eye = 4.4 * np.array([np.cos(azimuth), np.sin(azimuth), 0.25])
+    rays = camera_rays(size, eye, np.zeros(3), np.radians(29))
+    ray, points, face, weights, normals = hits(load_mesh(path), eye, rays.reshape(-1, 3))
+    seen = np.zeros(size * size, bool)
     seen[ray] = True
     view = _view(rays, seen.reshape(size, size), normals)
     view.positions, view.triangle, view.weights = points, face, weights.astype(np.float32)

@@ -8,7 +8,6 @@ costs is measured at a few pixels, against the map itself. Writes pictures and a
     python examples/area_lights.py --output output/area_lights
 """
 
-import argparse
 import functools
 import time
 from collections.abc import Callable
@@ -216,11 +215,9 @@ def check(rows: list[dict]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("output/area_lights"), help="folder for pictures and table")
+    parser = _scene.output_parser(__doc__, "area_lights")
     parser.add_argument("--size", type=int, default=192, help="width of a picture in pixels")
     parser.add_argument("--nodes", type=int, default=16, help="Gauss nodes along each side of a triangle")
-    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
     options = parser.parse_args(arguments)
     _scene.prepare_output(options.output, options.overwrite, "area_lights.md", parser)
     start = time.perf_counter()

@@ -6,7 +6,6 @@ The file has 10 % log-normal noise and half of its bins missing. Read as it is, 
     python examples/denoise.py --output output/denoise
 """
 
-import argparse
 import warnings
 from pathlib import Path
 
@@ -75,9 +74,7 @@ def table(rows: list[dict]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", type=Path, required=True, help="a new folder")
-    parser.add_argument("--overwrite", action="store_true", help="replace the folder if this program wrote it")
+    parser = _scene.output_parser(__doc__, "denoise")
     parser.add_argument("--size", type=int, default=192, help="pixels on a side of each picture")
     parser.add_argument("--noise", type=float, default=0.1, help="standard deviation of the logarithm")
     parser.add_argument("--holes", type=float, default=0.5, help="share of the bins that are missing")

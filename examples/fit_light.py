@@ -10,7 +10,6 @@ Writes a picture and a table to --output.
     python examples/fit_light.py --output output/fit_light
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -148,12 +147,10 @@ def table(rows: list[_fit.Row]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("output/fit_light"), help="folder for picture and table")
+    parser = _scene.output_parser(__doc__, "fit_light")
     parser.add_argument("--size", type=int, default=48, help="width of the picture in pixels, a divisor of that stored")
     parser.add_argument("--steps", type=int, default=25, help="most steps from one start")
     parser.add_argument("--noisy", type=int, default=2, help="fits to pictures with noise")
-    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
     options = parser.parse_args(arguments)
     _scene.prepare_output(options.output, options.overwrite, "fit_light.md", parser)
     start = time.perf_counter()

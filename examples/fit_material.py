@@ -9,7 +9,6 @@ Writes a picture and a table to --output.
     python examples/fit_material.py --output output/fit_material
 """
 
-import argparse
 import time
 import warnings
 from collections.abc import Callable
@@ -121,13 +120,11 @@ def table(rows: list[_fit.Row], degree: int) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("output/fit_material"), help="folder for picture and table")
+    parser = _scene.output_parser(__doc__, "fit_material")
     parser.add_argument("--size", type=int, help="width of the picture in pixels, a divisor of that stored")
     parser.add_argument("--degree", type=int, default=20, help="of the lobes; the error falls with it")
     parser.add_argument("--steps", type=int, default=30, help="most steps of one fit at one degree")
     parser.add_argument("--noisy", type=int, default=2, help="fits to pictures with noise")
-    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
     options = parser.parse_args(arguments)
     _scene.prepare_output(options.output, options.overwrite, "fit_material.md", parser)
     start = time.perf_counter()

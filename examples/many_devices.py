@@ -220,14 +220,12 @@ def check(rows: list[dict]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("output/many_devices"), help="folder for the table")
+    parser = _scene.output_parser(__doc__, "many_devices")
     parser.add_argument("--degree", type=int, default=16)
     parser.add_argument("--pixels", type=int, default=16384, help="pixels of each device")
     parser.add_argument("--devices", type=int, nargs="+", default=[2, 4], help="simulated devices of one process")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--sizes", action="store_true", help="only print what is copied and sent, and end")
-    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
     parser.add_argument("--worker", nargs=2, metavar=("FOLDER", "PROCESS"), help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.worker:

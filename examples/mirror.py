@@ -7,7 +7,6 @@ rays for each pixel under the same pixel filter.
     python examples/mirror.py --output output/mirror
 """
 
-import argparse
 from pathlib import Path
 
 import _scene
@@ -84,9 +83,7 @@ def table(rows: list[dict]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", type=Path, required=True, help="a new folder")
-    parser.add_argument("--overwrite", action="store_true", help="replace the folder if this program wrote it")
+    parser = _scene.output_parser(__doc__, "mirror")
     parser.add_argument("--size", type=int, default=96, help="pixels on a side")
     options = parser.parse_args()
     _scene.prepare_output(options.output, options.overwrite, "mirror.md", parser)

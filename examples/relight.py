@@ -7,7 +7,6 @@ scene, whose own error is known and taken off. Writes pictures, false-colour err
     python examples/relight.py --output output/relight
 """
 
-import argparse
 import csv
 import functools
 import itertools
@@ -241,13 +240,11 @@ def check(rows: list[dict]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("output/relight"), help="folder for pictures and table")
+    parser = _scene.output_parser(__doc__, "relight")
     parser.add_argument("--size", type=int, default=128, help="width of the sphere's picture in pixels")
     parser.add_argument("--samples", type=int, default=1024, help="Monte Carlo samples per pixel of the reference")
     parser.add_argument("--degrees", type=int, nargs="+", default=list(DEGREES))
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
     options = parser.parse_args(arguments)
     _scene.prepare_output(options.output, options.overwrite, "relight.csv", parser)
     start = time.perf_counter()

@@ -7,7 +7,6 @@ pixel.
     python examples/visibility.py --output output/visibility
 """
 
-import argparse
 from pathlib import Path
 
 import _scene
@@ -79,9 +78,7 @@ def check(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", type=Path, required=True, help="a new folder")
-    parser.add_argument("--overwrite", action="store_true", help="replace the folder if this program wrote it")
+    parser = _scene.output_parser(__doc__, "visibility")
     parser.add_argument("--size", type=int, default=320, help="pixels on a side")
     parser.add_argument("--samples", type=int, default=512, help="rays at every pixel of the reference")
     parser.add_argument("--rays", type=int, default=4096, help="rays at every vertex")

@@ -26,6 +26,14 @@ def real_array(name: str, value: ArrayLike) -> Array:
     raise ValueError(f"`{name}` must hold real numbers; got dtype {array.dtype}. Pass float32 or float64.")
 
 
+def scalar(name: str, value: ArrayLike) -> Array:
+    """`value` as one floating number."""
+    array = real_array(name, value)
+    if array.ndim:
+        raise ValueError(f"`{name}` must be a scalar; got shape {list(array.shape)}.")
+    return array
+
+
 def vectors(name: str, value: ArrayLike) -> Array:
     """`value` as floating vectors [..., 3]."""
     array = real_array(name, value)

@@ -101,9 +101,7 @@ def fit_brdf(
         raise ValueError(f"`weights` must have shape [N] = [{len(wi)}]; got {list(w.shape)}.")
     if not isinstance(isotropic, bool):
         raise ValueError(f"`isotropic` must be True or False; got {isotropic!r}.")
-    ridge = _checks.real_array("ridge", ridge)
-    if ridge.ndim:
-        raise ValueError(f"`ridge` must be a scalar; got shape {list(ridge.shape)}.")
+    ridge = _checks.scalar("ridge", ridge)
     return _fit(wi.astype(y.dtype), wo.astype(y.dtype), y, w.astype(y.dtype), ridge.astype(y.dtype), degree, isotropic,
                 max_steps)  # fmt: skip
 
@@ -235,9 +233,7 @@ def smooth_brdf(brdf: ProjectedBrdf, kappa: ArrayLike) -> ProjectedBrdf:
     """
     if not isinstance(brdf, ProjectedBrdf):
         raise ValueError(f"`brdf` must be a models.ProjectedBrdf; got {type(brdf).__name__}. Fit one with fit_brdf.")
-    kappa = _checks.real_array("kappa", kappa)
-    if kappa.ndim:
-        raise ValueError(f"`kappa` must be a scalar; got shape {list(kappa.shape)}.")
+    kappa = _checks.scalar("kappa", kappa)
     c, degree = brdf.coefficients, brdf.degree
     factor = _von_mises_fisher(kappa.astype(c.dtype), degree)
     factor = factor if brdf.isotropic else factor[_tables.bands(degree)]

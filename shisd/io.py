@@ -61,7 +61,7 @@ def write_image(path: StrPath, image: np.ndarray, *, overwrite: bool = False) ->
         raise ValueError(f"`image` must have shape [H, W] or [H, W, 3]; got {list(pixels.shape)}.")
     if not np.all((pixels >= 0) & (pixels <= 1)):
         raise ValueError("`image` must hold display values in [0, 1]; pass it through shisd.io.tonemap first.")
-    pillow = _optional("PIL.Image", "Pillow")
+    pillow = optional("PIL.Image", "the package Pillow")
     picture = pillow.fromarray(np.round(255 * pixels).astype(np.uint8))
     with _create(path, overwrite) as file:
         picture.save(file, format="PNG")
@@ -161,17 +161,18 @@ def _create(path: Path, overwrite: bool):
         raise FileExistsError(f"{path} exists; pass overwrite=True to replace it.") from error
 
 
-def _optional(module: str, package: str) -> ModuleType:
+def optional(module: str, package: str, extra: str = "io") -> ModuleType:
+    """A module of an optional package, or an error that says what to install."""
     import importlib
 
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f"This needs the package {package}: pip install shisd[io].") from error
+        raise ImportError(f"This needs {package}: pip install shisd[{extra}].") from error
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    openexr = _optional("OpenEXR", "OpenEXR")
+    openexr = optional("OpenEXR", "the package OpenEXR")
     try:
         with openexr.File(str(path), separate_channels=True) as file:
             header = dict(file.header())  # the file's own is emptied when it closes

@@ -11,13 +11,14 @@ from scipy.special import ive
 
 from shisd import filtering, io, models
 from tests.marks import FLOAT32_FIRST
-from tests.models.materials import GOLD_PAINT, array, evaluate, hemisphere, hemisphere_rule, pairs, spherical
-from tests.models.test_projected import scipy_basis
+from tests.models.materials import GOLD_PAINT, albedos, array, evaluate, hemisphere, pairs, spherical, spoiled
+from tests.truth import scipy_basis
 
 OK, UNCOVERED, STEP_LIMIT = (
     filtering.FitStatus.ok, filtering.FitStatus.uncovered, filtering.FitStatus.step_limit,
 )  # fmt: skip
 N = 1500
+ELEVATIONS = (0.0, 0.5, 1.0, 1.3)
 
 
 def cosine_spread(rng, count):
@@ -197,19 +198,6 @@ def test_errors_say_what_to_pass(as_user):
         filtering.denoise_merl(np.full((90, 90, 180, 3), -1.0), smoothness=1)
 
 
-def spoiled(clean, rng, noise=0.1, holes=0.5):
-    """A table with log-normal noise, and with bins missing in all colours."""
-    table = clean * np.exp(noise * rng.standard_normal(clean.shape))
-    return np.where(rng.random(clean.shape[:3])[..., None] < holes, -1.0, table)
-
-
-def albedos(brdf, elevations=(0.0, 0.5, 1.0, 1.3)):
-    """Hemispherical-directional albedo by quadrature, [elevations, 3]."""
-    wi, weight = (array(a, np.float32) for a in hemisphere_rule(90, 120))
-    views = [jnp.broadcast_to(array(spherical(e, 0.3), np.float32), wi.shape) for e in elevations]
-    return np.stack([(weight * wi[:, 2]) @ evaluate(brdf, wi, view) for view in views])
-
-
 def check_denoised(brdf, path, rng, smoothness):
     """Three times less RMS error than the noise, albedo to 1 %, reciprocity to 1e-12."""
     io.write_merl(path, brdf)
@@ -225,7 +213,7 @@ def check_denoised(brdf, path, rng, smoothness):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         io.write_merl(path, clean, overwrite=True)
-        before, after = albedos(models.MeasuredBrdf.from_merl(path)), albedos(result.brdf)
+        before, after = (albedos(m, ELEVATIONS, (90, 120)) for m in (models.MeasuredBrdf.from_merl(path), result.brdf))
     np.testing.assert_allclose(after, before, rtol=0.01)
     np.testing.assert_allclose(after.mean(axis=0), before.mean(axis=0), rtol=0.01)
     with jax.enable_x64(True):

@@ -24,8 +24,8 @@ from shisd.decomposition._directions import TABLE_DEGREE
 from shisd.domains import _moments
 from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, loop_solid_angle
-from shisd.domains._region import SphericalCap
-from shisd.harmonics import _tables, legendre, sh_basis
+from shisd.domains._region import SphericalCap, cap_coefficients, cap_integrals
+from shisd.harmonics import _tables, legendre
 
 Region = SphericalPolygon | SphericalCap
 
@@ -115,7 +115,7 @@ def _checked_axes(axes: Array) -> Array:
 def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "k l"]:
     d = _checked_axes(axes)
     if isinstance(region, SphericalCap):
-        return region.zonal_integrals(degree)[None] * legendre(d @ region.axis.astype(d.dtype), degree)
+        return cap_integrals(region.versine, degree)[None] * legendre(d @ region.axis.astype(d.dtype), degree)
     v, d = same_dtype(region.loop(), d)
     angle = jnp.broadcast_to(loop_solid_angle(v, region.largest)[None, None], (1, d.shape[0], 1))
     rest = [_moments.moments(d, v, degree)] if degree else []
@@ -131,8 +131,7 @@ def _axial_moments(polygon: SphericalPolygon, axes: Array, order: int) -> Float[
 @eqx.filter_jit
 def _coefficients(region: Region, degree: int) -> Float[Array, " n"]:
     if isinstance(region, SphericalCap):
-        scale = region.zonal_integrals(degree)[_tables.bands(degree)]
-        return scale * sh_basis(region.axis, degree)
+        return cap_coefficients(region.versine, region.axis, degree)
     v = region.loop()
     return loop_coefficients(v, loop_solid_angle(v, region.largest), degree)[:, 0]
 

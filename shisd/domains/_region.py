@@ -8,6 +8,7 @@ from jax.typing import ArrayLike
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float, Scalar
+from shisd.harmonics import _tables, sh_basis
 from shisd.harmonics._zh import legendre_of_versine
 
 
@@ -29,14 +30,16 @@ class SphericalCap(eqx.Module):
             raise ValueError(f"`angle` must be one number; got shape {list(size.shape)}.")
         self.axis, self.angle = normalize(a), size.astype(a.dtype)
 
-    def zonal_integrals(self, degree: int) -> Float[Array, " l"]:
-        """Integrals of P_l(w . axis) over the cap, l = 0 ... degree."""
-        return cap_integrals(2 * jnp.sin(self.angle / 2) ** 2, degree)
+    @property
+    def versine(self) -> Scalar:
+        """1 - cos(angle), without cancellation."""
+        return 2 * jnp.sin(self.angle / 2) ** 2
 
 
 def cap_integrals(versine: Float[Array, "*batch"], degree: int) -> Float[Array, "*batch l"]:
-    """2 pi times the integrals of P_l(x) from 1 - t to 1, t = `versine` of the cap's angle, in [0, 2].
+    """Integrals of P_l(w . axis) over caps, l = 0 ... degree: 2 pi times those of P_l(x) from 1 - t to 1.
 
+    t = `versine` of a cap's angle, in [0, 2].
     By Legendre's equation they are 2 pi (1 - x^2) P_l'(x) / (l (l+1)) at x = 1 - t, and P_l' is the sum of (2k+1) P_k
     for k = l-1, l-3, ...: no digit is lost in small caps, as it is in (P_{l-1} - P_{l+1}) / (2l+1).
     """
@@ -48,6 +51,11 @@ def cap_integrals(versine: Float[Array, "*batch"], degree: int) -> Float[Array, 
     p = legendre_of_versine(versine, degree - 1)
     rest = t * (2 - t) * jnp.matmul(p, jnp.asarray(slopes, t.dtype), precision="highest")
     return 2 * np.pi * jnp.concatenate([t, rest], axis=-1)
+
+
+def cap_coefficients(versine: Float[Array, "*batch"], axis: Float[Array, "*batch 3"], degree: int) -> Array:
+    """SH coefficients [..., n] of the indicators of caps about axes [..., 3], of any length but zero."""
+    return cap_integrals(versine, degree)[..., np.asarray(_tables.bands(degree))] * sh_basis(axis, degree)
 
 
 def hemisphere(normal: ArrayLike) -> SphericalCap:

@@ -83,7 +83,12 @@ class PortalLight(eqx.Module):
 def lobe_product(light: Float[Array, "*colour_n"], degree: int) -> Float[Array, "*colour_n_m"]:
     """From coefficients of a lobe of this degree to those of its product with a light, all of them."""
     light_degree = _checks.degree_of(light.shape[-1])
-    rows = [product_matrix(c, light_degree + degree, input_degree=degree) for c in light.reshape(-1, light.shape[-1])]
+    return product_matrices(light, light_degree + degree, degree)
+
+
+def product_matrices(light: Float[Array, "*colour_n"], degree: int, input_degree: int) -> Float[Array, "*colour_n_m"]:
+    """`harmonics.product_matrix` of the light of every colour."""
+    rows = [product_matrix(c, degree, input_degree=input_degree) for c in light.reshape(-1, light.shape[-1])]
     return jnp.stack(rows).reshape(*light.shape[:-1], *rows[0].shape)
 
 
@@ -126,8 +131,7 @@ class SphereLight(eqx.Module):
         d, degree = _checks.real_array("distance", distance), _checks.degree(degree)
         dtype = jnp.promote_types(d.dtype, self.radius.dtype)
         d, light = d.astype(dtype), jax.tree.map(lambda x: x.astype(dtype), self)
-        z = cap_integrals(versine(light, d * d), degree) 
-        z = times(z, jnp.asarray(_tables.zonal_norms(degree), dtype))
+        z = times(cap_integrals(versine(light, d * d), degree), jnp.asarray(_tables.zonal_norms(degree), dtype))
         return times(z.reshape(*d.shape, *(1,) * len(self.colour), degree + 1), light.emission[..., None])
 
 

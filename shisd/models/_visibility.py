@@ -15,7 +15,6 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import equinox as eqx
 import jax
@@ -23,10 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from shisd import _checks
+from shisd import _checks, io
 from shisd._typing import Array, Float, Scalar
-from shisd.domains._region import cap_integrals
-from shisd.harmonics import _tables, sh_basis
+from shisd.domains._region import cap_coefficients
+from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
 from shisd.harmonics._sh import weighted_sums
 
@@ -98,7 +97,7 @@ class Visibility(eqx.Module):
         without a normal (of no triangle, or only of triangles without area), with their number; ImportError without
         the packages.
         Not differentiable: for gradients see the derivative of `shade_environment_visibility` in the coefficients.
-        Cost: V x rays rays, about a million per second.
+        Cost: V x rays rays.
         """
         degree, rays = _checks.degree(degree), _checks.integer("rays", rays, minimum=2)
         points, corners = _mesh(vertices, triangles)
@@ -111,8 +110,9 @@ class Visibility(eqx.Module):
                 f"{bad} of {len(n)} vertices have no normal: they belong to no triangle with an area. Remove them, or "
                 "pass `normals`."
             )
-        shape = _optional("trimesh").Trimesh(points, corners, process=False)
-        blocked = _optional("trimesh.ray.ray_pyembree").RayMeshIntersector(shape).intersects_any
+        rays_of = io.optional("trimesh.ray.ray_pyembree", "the packages trimesh and embreex", "mesh")
+        trimesh = io.optional("trimesh", "the package trimesh", "mesh")
+        blocked = rays_of.RayMeshIntersector(trimesh.Trimesh(points, corners, process=False)).intersects_any
         start = points + offset * np.linalg.norm(np.ptp(points, axis=0)) * n / length[:, None]
         frames = _frames(n / length[:, None], np.random.default_rng(seed))
         local = _stratified(rays // 2, len(points), seed)
@@ -157,8 +157,7 @@ def cap_visibility(axes: ArrayLike, angles: ArrayLike, degree: int) -> Float[Arr
     except ValueError as error:
         raise ValueError(f"`axes` {list(a.shape)} and `angles` {list(angle.shape)} do not broadcast.") from error
     a, angle = jnp.broadcast_to(a, (*shape, 3)).astype(dtype), jnp.broadcast_to(angle, shape).astype(dtype)
-    hidden = cap_integrals(2 * jnp.sin(angle / 2) ** 2, degree)[..., np.asarray(_tables.bands(degree))]
-    return (-hidden * sh_basis(a, degree)).at[..., 0].add(np.sqrt(4 * np.pi))
+    return (-cap_coefficients(2 * jnp.sin(angle / 2) ** 2, a, degree)).at[..., 0].add(np.sqrt(4 * np.pi))
 
 
 def surface_corners(visibility: Visibility, triangle: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
@@ -244,14 +243,3 @@ def _npz(path: str | os.PathLike[str]) -> Path:
     if path.suffix != ".npz":
         raise ValueError(f"{path}: visibility is stored as .npz; got suffix {path.suffix!r}.")
     return path
-
-
-def _optional(module: str) -> ModuleType:
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            "Ray casting needs trimesh and embreex: pip install shisd[mesh]. Visibility.load needs neither."
-        ) from error

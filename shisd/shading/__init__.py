@@ -3,14 +3,14 @@
 Directions are in world space and point away from the surface; image colour is the last axis.
 """
 
+from shisd.shading._degree import band_energies as band_energies
+from shisd.shading._degree import material_degree as material_degree
 from shisd.shading._environment import shade_environment as shade_environment
 from shisd.shading._footprint import MirrorFootprint as MirrorFootprint
 from shisd.shading._footprint import mirror_footprint as mirror_footprint
 from shisd.shading._lobes import Lobes as Lobes
 from shisd.shading._lobes import tabulate_brdf as tabulate_brdf
 from shisd.shading._matrix import BrdfMatrix as BrdfMatrix
-from shisd.shading._matrix import band_energies as band_energies
-from shisd.shading._matrix import material_degree as material_degree
 from shisd.shading._matrix import project_brdf as project_brdf
 from shisd.shading._matrix import shade_matrix as shade_matrix
 from shisd.shading._mirror import MirrorMaps as MirrorMaps

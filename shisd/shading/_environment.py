@@ -8,6 +8,8 @@ pixel, and to turn the light is to turn three colours. tests/bench compares the 
 notation: R = (t, b, n) local to world; e = light coefficients.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +20,7 @@ from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics._pairing import pair_many, turned_series
 from shisd.shading._lobes import Lobes, check_lobes, slice_orders
-from shisd.shading._surface import shade_points, shade_tiles, surface
+from shisd.shading._surface import Surface, shade_points, shade_tiles, surface
 
 _NUMBERS_AT_ONCE = 3 << 18  # coefficients of slices in a tile: small ones keep one core busy, large ones leave caches
 _LARGEST_TILE = 4096
@@ -50,7 +52,7 @@ def shade_environment(
     check_lobes(lobes, everywhere=True)
     e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
     light = [("light_coefficients", e.shape[:-1])]
-    lobes, points, colour = surface(lobes, tangents, light, [e.dtype], normals=normals, views=views)
+    lobes, points, colour = surface("lobes", lobes, tangents, light, [e.dtype], normals=normals, views=views)
     degree = min(light_degree, lobes.degree)
     e = e[..., : (degree + 1) ** 2].astype(lobes.weights.dtype)
     return by_device(shade_points, points, _shade, lobes, e, colour)
@@ -60,13 +62,24 @@ def shade_environment(
 def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, e: Float[Array, "*c n"], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
+    return shade_slices(points, lobes, slice_orders(lobes, _checks.degree_of(e.shape[-1])), e, colour)
+
+
+def shade_slices(
+    points: dict[str, Float[Array, "p 3"]],
+    material: Surface,
+    look_up: Callable[[Float[Array, "p 3"]], tuple[Array, Array]],
+    e: Float[Array, "*c n"],
+    colour: tuple[int, ...],
+) -> Float[Array, " p *colour"]:
+    """Radiance from the slices that `look_up` gives for local views, in the order of `harmonics._pairing`."""
     degree = _checks.degree_of(e.shape[-1])
-    look_up, series = slice_orders(lobes, degree), turned_series(e.reshape(-1, e.shape[-1]), degree)
+    series = turned_series(e.reshape(-1, e.shape[-1]), degree)
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
         to_local = jnp.swapaxes(frame, 1, 2)
-        return pair_many(*look_up(local), series, to_local, degree, lobes.isotropic).reshape(*colour, -1)
+        return pair_many(*look_up(local), series, to_local, degree, material.isotropic).reshape(*colour, -1)
 
-    numbers = (degree + 1) ** 2 * int(np.prod(lobes.colour))
+    numbers = (degree + 1) ** 2 * int(np.prod(material.colour))
     size = min(_LARGEST_TILE, max(1, _NUMBERS_AT_ONCE // numbers))
-    return shade_tiles(lobes, points, colour, size, radiance)
+    return shade_tiles(material, points, colour, size, radiance)

@@ -63,7 +63,7 @@ class MirrorFootprint(eqx.Module):
         n, x = _checks.vectors("normals", normals), _checks.vectors("positions", positions)
         dn = _axes("normal_derivatives", normal_derivatives)
         dx = _axes("position_derivatives", position_derivatives)
-        e, width = _eye(eye), _width(filter_width)
+        e, width = _eye(eye), _checks.scalar("filter_width", filter_width)
         try:
             shape = np.broadcast_shapes(n.shape, x.shape, dn.shape[:-1], dx.shape[:-1])
         except ValueError as error:
@@ -97,7 +97,7 @@ def mirror_footprint(
     Source: ISD15 Eq. 27, ISD15s section 5; the symmetric fit in closed form is R. A. Smith's for A X + X A = M (1966).
     """
     n, x = _checks.vectors("normals", normals), _checks.vectors("positions", positions)
-    e, width, mask = _eye(eye), _width(filter_width), jnp.asarray(seen)
+    e, width, mask = _eye(eye), _checks.scalar("filter_width", filter_width), jnp.asarray(seen)
     if mask.dtype != bool or mask.ndim != 2 or n.shape != x.shape or mask.shape != n.shape[:-1]:
         raise ValueError(
             "`normals` and `positions` must have shape [H, W, 3] and `seen` [H, W], bool; got "
@@ -112,13 +112,6 @@ def _eye(eye: ArrayLike) -> Float[Array, "3"]:
     if e.ndim != 1:
         raise ValueError(f"`eye` must have shape [3]; got {list(e.shape)}.")
     return e
-
-
-def _width(filter_width: ArrayLike) -> Array:
-    width = _checks.real_array("filter_width", filter_width)
-    if width.ndim:
-        raise ValueError(f"`filter_width` must be a scalar; got {list(width.shape)}.")
-    return width
 
 
 @jax.jit

@@ -22,19 +22,18 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 
 from shisd import _checks
-from shisd._numerics import angle_multiples, normalize, safe_sqrt
+from shisd._numerics import angle_multiples, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import _quadrature, _tables, sh_basis
-from shisd.harmonics._pairing import pair_many, turned_series
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
-from shisd.shading._lobes import RIDGE, Lobes, hemisphere_blocks, products_in_order, resolved, slices_at
-from shisd.shading._surface import frame, in_tiles, shade_points, tangent_frame
+from shisd.shading._environment import shade_slices
+from shisd.shading._lobes import RIDGE, Lobes, products_in_order, resolved, slices_at
+from shisd.shading._surface import shade_points, surface
 
 _VIEW_RIDGE = 1e-10  # of fits over views
-_NUMBERS_AT_ONCE, _LARGEST_TILE = 3 << 18, 4096  # as in `_environment`
 
 
 class BrdfMatrix(eqx.Module):
@@ -62,7 +61,7 @@ class BrdfMatrix(eqx.Module):
             return self.blocks[0]
         full = jnp.zeros((*self.colour, (self.degree + 1) ** 2, (self.view_degree + 1) ** 2), self.blocks[0].dtype)
         for m in range(1 - len(self.blocks), len(self.blocks)):
-            rows, columns = _of_order(self.degree, m), _of_order(self.view_degree, m)
+            rows, columns = of_order(self.degree, m), of_order(self.view_degree, m)
             full = full.at[..., rows[:, None], columns[None, :]].set(self.blocks[abs(m)])
         return full
 
@@ -143,13 +142,13 @@ def _project(
         return (jnp.swapaxes(samples, -1, -2) @ to_modes) @ to_coefficients
 
     if brdf.isotropic:
-        return tuple(fitted(c[..., _of_order(degree, m)], m) for m in range(min(degree, view_degree) + 1)), error
+        return tuple(fitted(c[..., of_order(degree, m)], m) for m in range(min(degree, view_degree) + 1)), error
     phi = 2 * np.pi * np.arange(azimuths) / azimuths
     columns = []
     for m in range(-view_degree, view_degree + 1):
         wave = (np.cos(m * phi) if m >= 0 else np.sin(-m * phi)) * (1 if m == 0 else 2) / azimuths
         columns.append(fitted(jnp.einsum("...vai,a->...vi", c, jnp.asarray(wave, dtype)), abs(m)))
-    order = np.concatenate([_of_order(view_degree, m) for m in range(-view_degree, view_degree + 1)])
+    order = np.concatenate([of_order(view_degree, m) for m in range(-view_degree, view_degree + 1)])
     return (jnp.concatenate(columns, axis=-1)[..., np.argsort(order)],), error
 
 
@@ -158,7 +157,7 @@ def _azimuths(degree: int, view_degree: int) -> int:
     return max(32, 2 * max(degree, view_degree) + 4)
 
 
-def _of_order(degree: int, m: int) -> np.ndarray:
+def of_order(degree: int, m: int) -> np.ndarray:
     """Where the coefficients of order m are, l = |m| ... degree."""
     l = np.arange(abs(m), degree + 1)
     return l * l + l + m
@@ -215,22 +214,9 @@ def shade_matrix(
     if matrix.domain != "sphere":
         raise ValueError("`matrix` was fitted above the horizon only; project the material with domain='sphere'.")
     e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
-    vectors = {"normals": normals, "views": views}
-    if not matrix.isotropic:
-        if tangents is None:
-            raise ValueError("`tangents` [..., 3] are needed: this material is anisotropic.")
-        vectors["tangents"] = tangents
-    points = {name: _checks.vectors(name, value) for name, value in vectors.items()}
-    try:
-        np.broadcast_shapes(*(a.shape for a in points.values()))
-        colour = np.broadcast_shapes(matrix.colour, e.shape[:-1])
-    except ValueError as error:
-        shapes = {name: list(a.shape) for name, a in points.items()}
-        colours = f"`matrix` {list(matrix.colour)} and `light_coefficients` {list(e.shape[:-1])}"
-        raise ValueError(f"batch axes {shapes}, or colours of {colours}, do not broadcast.") from error
-    dtype = jnp.result_type(*matrix.blocks, e, *points.values())
-    matrix, points = jax.tree.map(lambda x: x.astype(dtype), (matrix, points))
-    e = e[..., : (min(light_degree, matrix.degree) + 1) ** 2].astype(dtype)
+    light = [("light_coefficients", e.shape[:-1])]
+    matrix, points, colour = surface("matrix", matrix, tangents, light, [e.dtype], normals=normals, views=views)
+    e = e[..., : (min(light_degree, matrix.degree) + 1) ** 2].astype(matrix.blocks[0].dtype)
     return by_device(shade_points, points, _shade, matrix, e, colour)
 
 
@@ -239,31 +225,20 @@ def _shade(
     points: dict[str, Float[Array, "p 3"]], matrix: BrdfMatrix, e: Float[Array, "*c n"], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     degree = _checks.degree_of(e.shape[-1])
-    series = turned_series(e.reshape(-1, e.shape[-1]), degree)
     if matrix.isotropic:
         factors = lambda view: _chebyshev(view, matrix.view_degree)
         look_up = products_in_order(_polar_table(matrix, degree), degree, factors, _waves)
     else:
         table = matrix.blocks[0][..., : (degree + 1) ** 2, :]
         look_up = products_in_order(table, degree, lambda view: sh_basis(view, matrix.view_degree).T, None)
-
-    def shade(tile: dict[str, Float[Array, "p 3"]]) -> Float[Array, " p *colour"]:
-        directions = {name: normalize(a) for name, a in tile.items()}
-        normal = directions["normals"]
-        r = frame(normal) if matrix.isotropic else tangent_frame(normal, directions["tangents"])
-        view = jnp.einsum("pij,pi->pj", r, directions["views"])
-        values = pair_many(*look_up(view), series, jnp.swapaxes(r, 1, 2), degree, matrix.isotropic)
-        return jnp.where(view[:, 2] < 0, 0, values).T.reshape(-1, *colour)
-
-    numbers = (degree + 1) ** 2 * int(np.prod(matrix.colour))
-    return in_tiles(shade, points, min(_LARGEST_TILE, max(1, _NUMBERS_AT_ONCE // numbers)))
+    return shade_slices(points, matrix, look_up, e, colour)
 
 
 def _polar_table(matrix: BrdfMatrix, degree: int) -> Float[Array, "*colour n k"]:
     """Rows m >= 0 of slices at azimuth 0 over `_waves`, as sums of Chebyshev polynomials of z."""
     series, blocks = _chebyshev_series(matrix.view_degree), matrix.blocks[: degree + 1]
     rows = [b[..., : degree + 1 - m, :] @ jnp.asarray(series[m, m:], b.dtype) for m, b in enumerate(blocks)]
-    order = np.concatenate([_of_order(degree, m) for m in range(len(blocks))])
+    order = np.concatenate([of_order(degree, m) for m in range(len(blocks))])
     table = jnp.zeros((*matrix.colour, (degree + 1) ** 2, matrix.view_degree + 1), rows[0].dtype)
     return table.at[..., order, :].set(jnp.concatenate(rows, axis=-2))
 
@@ -301,71 +276,3 @@ def _waves(view: Float[Array, "p 3"], count: int) -> tuple[Float[Array, "m p"], 
     m = np.arange(count)[:, None]
     even = jnp.asarray((m % 2 == 0) & (m > 0))
     return jnp.where(even, x * before_cos - y * before_sin, cos), jnp.where(even, x * before_sin + y * before_cos, sin)
-
-
-# ---- Degrees
-
-
-def band_energies(material: Lobes | BrdfMatrix) -> Float[Array, "*colour_views l"]:
-    """Energies of the bands of a material's slices, the squared norm that each adds to the lower ones.
-
-    Returns [*colour, V, L+1] for isotropic materials, [*colour, V, A, L+1] for anisotropic ones, in 1/sr: for the views
-    of `material.coefficients()`. Where the slices were fitted above the horizon, norms are those above it, of the best
-    fit of each degree there.
-    Derivatives: in the material.
-    """
-    _check_material(material)
-    c, degree = material.coefficients(), material.degree
-    if material.domain == "upper":
-        c = c @ jnp.asarray(_successive(degree), c.dtype)
-    member = _tables.bands(degree)[:, None] == np.arange(degree + 1)
-    return jnp.square(c) @ jnp.asarray(member, c.dtype)
-
-
-def material_degree(material: Lobes | BrdfMatrix, tolerance: float, *, worst: bool = False) -> int:
-    """The smallest degree whose slices differ from those given by at most `tolerance`, relative to their RMS.
-
-    Arguments: `material`; static `tolerance`; the RMS is over the views of a sphere's picture, by colour, of which the
-    worst counts; `worst=True` takes the worst view instead. The light is not asked: `planning` does that, and needs
-    less where the light is smooth.
-    The choice is made from values, not under jit. Slices end at the degree of the material, and what is beyond cannot
-    be seen: where its last two bands are needed for the tolerance (odd ones vanish for a Lambertian), that is an error.
-    """
-    _check_material(material)
-    if not tolerance > 0:
-        raise ValueError(f"`tolerance` must be > 0; got {tolerance}.")
-    try:
-        energy = np.asarray(band_energies(material), float)
-    except jax.errors.TracerArrayConversionError as error:
-        raise ValueError("the degree is chosen from values: call material_degree outside jit and grad.") from error
-    if not np.all(np.isfinite(energy)):
-        raise ValueError("`material` must be finite; its slices hold NaN or infinity.")
-    energy = energy.reshape(-1, *energy.shape[len(material.colour) :])  # [colour, V, (A,) l]
-    if not worst:
-        share = np.sin(2 * _views.elevations(energy.shape[1]))
-        energy = np.einsum("v,cv...l->cl", share, energy)
-    above = np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1]  # of bands l and higher
-    needed = np.any(above > tolerance**2 * above[..., :1], axis=tuple(range(above.ndim - 1)))
-    found = int(np.count_nonzero(needed)) - 1
-    if found > max(material.degree - 2, 0):
-        raise ValueError(
-            f"`material` of degree {material.degree} needs its last bands for `tolerance` {tolerance}, and may need "
-            "more: pass one of a higher degree."
-        )
-    return max(found, 0)
-
-
-def _check_material(material: object) -> None:
-    if not isinstance(material, Lobes | BrdfMatrix):
-        name = type(material).__name__
-        raise ValueError(f"`material` must come from shading.tabulate_brdf or shading.project_brdf; got {name}.")
-
-
-@functools.cache
-def _successive(degree: int) -> np.ndarray:
-    """Transposed, from coefficients to those by functions orthonormal above the horizon, made of y_l^m by rising l."""
-    table, blocks = np.zeros(((degree + 1) ** 2,) * 2), hemisphere_blocks(degree)
-    for m in range(-degree, degree + 1):
-        index = _of_order(degree, m)
-        table[np.ix_(index, index)] = np.linalg.cholesky(blocks[abs(m)] + RIDGE * np.eye(len(index)))
-    return table

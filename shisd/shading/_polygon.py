@@ -33,7 +33,7 @@ from shisd.models import PolygonLight, PortalLight
 from shisd.models._light import lobe_product
 from shisd.shading._incidence import incidence_integrals
 from shisd.shading._lobes import Lobes, check_lobes, lookup_factors, lookup_table, slice_values
-from shisd.shading._surface import in_tiles, shade_points, shade_tiles, surface
+from shisd.shading._surface import in_tiles, local_lights, shade_points, shade_tiles, surface
 
 Light = PolygonLight | PortalLight
 _TILE = 2048  # pixels at a time
@@ -122,9 +122,7 @@ def _shade_lights(
     tangents: ArrayLike | None,
 ) -> Float[Array, "*batch_colour"]:
     check_lobes(lobes, everywhere=False)
-    lights = tuple(light) if isinstance(light, Sequence) else (light,)
-    if not lights or not all(isinstance(x, kind) for x in lights):
-        raise ValueError(f"`{name}` must be a models.{kind.__name__} or a sequence of at least one.")
+    lights = local_lights(name, light, kind)
     for x in lights:
         if isinstance(x, PortalLight) and x.degree < lobes.degree:
             raise ValueError(
@@ -132,7 +130,7 @@ def _shade_lights(
             )
     colours = [(f"{name} {i}", x.colour) for i, x in enumerate(lights)]
     vectors = {"positions": positions, "normals": normals, "views": views}
-    lobes, points, colour = surface(lobes, tangents, colours, [x.points.dtype for x in lights], **vectors)
+    lobes, points, colour = surface("lobes", lobes, tangents, colours, [x.points.dtype for x in lights], **vectors)
     lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
     return by_device(shade_points, points, _shade, lobes, lights, colour)
 

@@ -1,7 +1,7 @@
 """Radiance from balls of light at finite distance: ISD15 Eq. 33 and 34, without occlusion.
 
 From every point a ball is a cap, a zonal light about the direction to its center a. Its coefficients are closed
-expressions of the ratio of radius and distance (`domains._region.cap_integrals`), and about another axis they are
+expressions of the ratio of radius and distance (`domains._region.cap_coefficients`), and about another axis they are
 z_l y_l^m(a) (Eq. 34): in the local frame nothing is rotated but a.
 
 notation: a = direction to the center, in the local frame; z_l = integral of P_l over the cap; R local to world.
@@ -12,18 +12,16 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 
 from shisd._numerics import times
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
-from shisd.domains._region import cap_integrals
-from shisd.harmonics import _tables, sh_basis
+from shisd.domains._region import cap_coefficients
 from shisd.models import SphereLight
 from shisd.models._light import versine
 from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
-from shisd.shading._surface import shade_points, shade_tiles, surface
+from shisd.shading._surface import local_lights, shade_points, shade_tiles, surface
 
 
 def shade_sphere(
@@ -47,12 +45,10 @@ def shade_sphere(
     Cost: (L+1)^2 harmonics for every light and point. Memory: one tile of 1024 points.
     """
     check_lobes(lobes, everywhere=True)
-    lights = tuple(light) if isinstance(light, Sequence) else (light,)
-    if not lights or not all(isinstance(x, SphereLight) for x in lights):
-        raise ValueError("`light` must be a models.SphereLight or a sequence of at least one.")
+    lights = local_lights("light", light, SphereLight)
     colours = [(f"light {i}", x.colour) for i, x in enumerate(lights)]
     vectors = {"positions": positions, "normals": normals, "views": views}
-    lobes, points, colour = surface(lobes, tangents, colours, [x.center.dtype for x in lights], **vectors)
+    lobes, points, colour = surface("lobes", lobes, tangents, colours, [x.center.dtype for x in lights], **vectors)
     lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
     return by_device(shade_points, points, _shade, lobes, lights, colour)
 
@@ -61,7 +57,7 @@ def shade_sphere(
 def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[SphereLight, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    table, bands = lookup_table(lobes), np.asarray(_tables.bands(lobes.degree))
+    table = lookup_table(lobes)
 
     def radiance(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
@@ -73,8 +69,7 @@ def _shade(
             t = jnp.where(light.radius > 0, versine(light, jnp.sum(to_center**2, axis=1)), jnp.nan)
             inside = (t >= 2)[:, None]  # then any axis will do
             a = jnp.einsum("pij,pi->pj", frame, jnp.where(inside, frame[:, :, 2], to_center))
-            cap = cap_integrals(t, lobes.degree)[:, bands] * sh_basis(a, lobes.degree)
-            lit = jnp.sum(times(slices, cap.T), axis=-2)
+            lit = jnp.sum(times(slices, cap_coefficients(t, a, lobes.degree).T), axis=-2)
             total += jnp.broadcast_to(times(lit, light.emission[..., None]), total.shape)
         return total
 

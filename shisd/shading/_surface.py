@@ -1,7 +1,7 @@
 """Surface points, as every shading verb takes them: their checks, their frames, and one tile of them after another."""
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -11,40 +11,62 @@ from jax.typing import ArrayLike, DTypeLike
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._typing import Array, Float
-from shisd.shading._lobes import Lobes
 
 Shape = tuple[int, ...]
+
+
+@runtime_checkable
+class Surface(Protocol):
+    """What is asked of a material, tabulated or as a matrix."""
+
+    @property
+    def isotropic(self) -> bool: ...
+    @property
+    def colour(self) -> Shape: ...
+
+
+Material = TypeVar("Material", bound=Surface)
 _DIRECTIONS = ("normals", "views", "tangents")
 _LANES = 64  # a tile is a multiple of this many points
 
 
 def surface(
-    lobes: Lobes,
+    name: str,
+    material: Material,
     tangents: ArrayLike | None,
     light: Iterable[tuple[str, Shape]],
     dtypes: Iterable[DTypeLike],
     **vectors: ArrayLike,
-) -> tuple[Lobes, dict[str, Array], Shape]:
-    """Lobes and arrays [..., 3] in the common dtype, and the colour of lobes and `light` together.
+) -> tuple[Material, dict[str, Array], Shape]:
+    """The material and arrays [..., 3] in the common dtype, and the colour of material and `light` together.
 
-    `tangents` are taken where the material needs them, `light` names the colour axes of each light.
+    `name` is that of the material's argument, `tangents` are taken where it needs them, `light` names the colour axes
+    of each light.
     """
-    if not lobes.isotropic:
+    if not material.isotropic:
         if tangents is None:
             raise ValueError("`tangents` [..., 3] are needed: this material is anisotropic.")
         vectors["tangents"] = tangents
-    arrays = {name: _checks.vectors(name, value) for name, value in vectors.items()}
-    colours = [("lobes", lobes.colour), *light]
+    arrays = {key: _checks.vectors(key, value) for key, value in vectors.items()}
+    colours = [(name, material.colour), *light]
     try:
         np.broadcast_shapes(*(a.shape for a in arrays.values()))
         colour = np.broadcast_shapes(*(c for _, c in colours))
     except ValueError as error:
-        shapes = {name: list(a.shape) for name, a in arrays.items()}
-        named = " and ".join(f"`{name}` {list(c)}" for name, c in colours)
+        shapes = {key: list(a.shape) for key, a in arrays.items()}
+        named = " and ".join(f"`{key}` {list(c)}" for key, c in colours)
         raise ValueError(f"batch axes {shapes}, or colours of {named}, do not broadcast.") from error
-    dtype = jnp.result_type(lobes.weights, *dtypes, *arrays.values())
+    dtype = jnp.result_type(*jax.tree.leaves(material), *dtypes, *arrays.values())
     cast = lambda x: x.astype(dtype)
-    return jax.tree.map(cast, lobes), jax.tree.map(cast, arrays), colour
+    return jax.tree.map(cast, material), jax.tree.map(cast, arrays), colour
+
+
+def local_lights(name: str, light: Any, kind: type) -> tuple:
+    """One light of this kind or a sequence of them, as a tuple."""
+    lights = tuple(light) if isinstance(light, Sequence) else (light,)
+    if not lights or not all(isinstance(x, kind) for x in lights):
+        raise ValueError(f"`{name}` must be a models.{kind.__name__} or a sequence of at least one.")
+    return lights
 
 
 def shade_points(points: dict[str, Array], shade: Callable[..., Array], *arguments: Any) -> Array:
@@ -56,7 +78,7 @@ def shade_points(points: dict[str, Array], shade: Callable[..., Array], *argumen
 
 
 def shade_tiles(
-    lobes: Lobes,
+    material: Surface,
     points: dict[str, Array],
     colour: Shape,
     size: int,
@@ -72,7 +94,7 @@ def shade_tiles(
         directions = {name: normalize(a) for name, a in tile.items() if name in _DIRECTIONS}
         others = {name: a for name, a in tile.items() if name not in _DIRECTIONS}
         normal = directions["normals"]
-        r = frame(normal) if lobes.isotropic else tangent_frame(normal, directions["tangents"])
+        r = frame(normal) if material.isotropic else tangent_frame(normal, directions["tangents"])
         local = jnp.einsum("pij,pi->pj", r, directions["views"])
         values = radiance(r, local, **others)
         return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(values, -1, 0))

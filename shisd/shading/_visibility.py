@@ -5,15 +5,14 @@ With v = visibility in the frame of the world, E = light and c = the slice turne
     I = integral of v E (R c) = sum over j of u_j (R c)_j,   u_j = integral of v E y_j = sum over i of M_ij v_i,
 
 where M is the matrix of products with E, exact. The paper takes the same steps in another order: it multiplies the
-slice by gamma, the weights of E y_j on rotated zonal harmonics, and looks up v at their axes. On a CPU a pixel is
-fastest with M v, one product of matrices for all, and turns its slice, which has the fewest colours: measured, 1.4
-times as fast as visible light interpolated between vertices.
+slice by gamma, the weights of E y_j on rotated zonal harmonics, and looks up v at their axes. On a CPU M v is one
+product of matrices for many pixels, faster than visible light interpolated between vertices, and a pixel turns its
+slice, which has the fewest colours. One v for all pixels is a light of its own.
 
 notation: u = coefficients of the visible light; R = (t, b, n) local to world.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -22,10 +21,12 @@ from shisd import _checks
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics import product_matrix
+from shisd.harmonics import multiply
 from shisd.harmonics._pairing import Each, pair_many, rows
 from shisd.models import Visibility
+from shisd.models._light import product_matrices
 from shisd.models._visibility import surface_corners
+from shisd.shading._environment import shade_environment
 from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import shade_points, shade_tiles, surface
 
@@ -65,23 +66,27 @@ def shade_environment_visibility(
             raise ValueError("`triangle` [...] and `weights` [..., 3] are needed: `visibility` is that of a mesh.")
         corners, vectors["weights"] = surface_corners(visibility, triangle, weights)
         own, v = {"corners": corners}, visibility.coefficients
+        dtypes = [e.dtype, v.dtype]
     else:
         if triangle is not None or weights is not None:
             raise ValueError("`triangle` and `weights` belong to a models.Visibility; pass that as `visibility`.")
         c, _ = _checks.coefficients("visibility", visibility)
-        own, v = ({}, c[None]) if c.ndim == 1 else ({"visibility": c}, None)
-    given = [e.dtype] + [x.dtype for x in (v, own.get("visibility")) if x is not None]
+        if c.ndim == 1:
+            return shade_environment(lobes, multiply(e, c, lobes.degree), normals, views, tangents)
+        own, v, dtypes = {"visibility": c}, None, [e.dtype, c.dtype]
     light = [("light_coefficients", e.shape[:-1])]
-    lobes, points, colour = surface(lobes, tangents, light, given, **vectors)
+    lobes, points, colour = surface("lobes", lobes, tangents, light, dtypes, **vectors)
     try:
         np.broadcast_shapes(*(a.shape[:-1] for a in (points | own).values()))
     except ValueError as error:
         shapes = {name: list(a.shape) for name, a in (points | own).items()}
         raise ValueError(f"batch axes {shapes} do not broadcast.") from error
     dtype = lobes.weights.dtype
-    e, v, c = (None if x is None else x.astype(dtype) for x in (e, v, own.get("visibility")))
-    points |= own if c is None else {"visibility": c}
-    return by_device(shade_points, points, _shade, lobes, e, v, colour)
+    if v is None:
+        own = {"visibility": own["visibility"].astype(dtype)}
+    else:
+        v = v.astype(dtype)
+    return by_device(shade_points, points | own, _shade, lobes, e.astype(dtype), v, colour)
 
 
 def visibility_gamma(light_coefficients: ArrayLike, basis: RotatedZonalBasis, degree: int) -> Float[Array, "*c n l k"]:
@@ -95,36 +100,25 @@ def visibility_gamma(light_coefficients: ArrayLike, basis: RotatedZonalBasis, de
     e, _ = _checks.expansion("light_coefficients", light_coefficients)
     if not isinstance(basis, RotatedZonalBasis):
         raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis; got {type(basis).__name__}.")
-    return basis.weights(jnp.swapaxes(_products(e, basis.degree, _checks.degree(degree)), -1, -2))
+    return basis.weights(jnp.swapaxes(product_matrices(e, basis.degree, _checks.degree(degree)), -1, -2))
 
 
 @eqx.filter_jit
 def _shade(
     points: dict[str, Array], lobes: Lobes, e: Float[Array, "*c n"], v: Array | None, colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    """`v` [V, nv] are the coefficients that points share; points have "corners" or a "visibility" of their own."""
+    """Points have "corners" and "weights" of vertices, whose coefficients are `v` [V, nv], or each its "visibility"."""
     degree, look_up = lobes.degree, slice_orders(lobes, lobes.degree)
     size = (points["visibility"] if v is None else v).shape[-1]
-    product = _products(e, degree, _checks.degree_of(size)).reshape(-1, (degree + 1) ** 2, size)
+    product = product_matrices(e, degree, _checks.degree_of(size)).reshape(-1, (degree + 1) ** 2, size)
     product = jnp.pad(product, ((0, 0), (0, 1), (0, 0)))
     plus, minus = (jnp.swapaxes(product[:, index], 0, 1) for index in rows(degree)[:2])
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], **at: Array) -> Float[Array, "*colour p"]:
-        if v is None:
-            seen = at["visibility"]
-        elif "corners" in at:
-            seen = jnp.einsum("pc,pcn->pn", at["weights"], v[at["corners"]])
-        else:
-            seen = jnp.broadcast_to(v, (len(local), size))
+        seen = at["visibility"] if v is None else jnp.einsum("pc,pcn->pn", at["weights"], v[at["corners"]])
         light = Each(*((m.reshape(-1, size) @ seen.T).reshape(*m.shape[:2], -1) for m in (plus, minus)))
         values = pair_many(*look_up(local), light, jnp.swapaxes(frame, 1, 2), degree, lobes.isotropic)
         return jnp.broadcast_to(values.reshape(*colour, -1), (*colour, len(local)))
 
     tile = _NUMBERS_AT_ONCE // ((degree + 1) ** 2 * len(product))
     return shade_tiles(lobes, points, colour, max(64, tile), radiance)
-
-
-def _products(e: Float[Array, "*c n"], degree: int, input_degree: int) -> Float[Array, "*c i j"]:
-    """For every colour the matrix from coefficients of visibility to those of its product with the light."""
-    one = lambda c: product_matrix(c, degree, input_degree=input_degree)
-    return one(e) if e.ndim == 1 else jax.vmap(one)(e)

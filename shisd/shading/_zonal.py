@@ -54,7 +54,7 @@ def shade_zonal(
     if not lights:
         a, z = a[None], z[None]
     light = [("zonal_coefficients", z.shape[1:-1])]
-    lobes, points, colour = surface(lobes, tangents, light, [a.dtype, z.dtype], normals=normals, views=views)
+    lobes, points, colour = surface("lobes", lobes, tangents, light, [a.dtype, z.dtype], normals=normals, views=views)
     dtype = lobes.weights.dtype
     z = z[..., : lobes.degree + 1].astype(dtype)
     return by_device(shade_points, points, _shade, lobes, normalize(a.astype(dtype)), z, colour)

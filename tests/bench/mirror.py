@@ -20,14 +20,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from examples._scene import camera_rays, unit
+from examples._scene import camera_rays, hits, load_mesh, unit
 from shisd import harmonics, models, shading
+from shisd._numerics import normalize
 from tests.bench.timing import interleaved
 
 DATA = Path(__file__).parents[2] / "examples" / "data"
 SIDE, WIDTH, REFERENCE = 96, 0.5, 16
 MAPS = {"interior": "interior.hdr", "studio": "studio.exr"}
 DEGREES = (16, 30, 60, 100)
+_mesh_of = functools.cache(load_mesh)
 
 
 @dataclass(frozen=True)
@@ -58,25 +60,10 @@ def _sphere(eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _rabbit(eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    import trimesh
-
-    shape = _mesh()
-    points, ray, face = shape.ray.intersects_location(np.broadcast_to(eye, rays.shape), rays, multiple_hits=False)
-    weights = trimesh.triangles.points_to_barycentric(shape.triangles[face], points)
     seen, normals, positions = np.zeros(len(rays), bool), np.zeros_like(rays), np.zeros_like(rays)
-    seen[ray], positions[ray] = True, points
-    normals[ray] = unit(np.einsum("nk,nkx->nx", weights, shape.vertex_normals[shape.faces[face]]))
+    ray, positions_seen, *_, normals_seen = hits(_mesh_of(DATA / "bunny.ply"), eye, rays)
+    seen[ray], positions[ray], normals[ray] = True, positions_seen, normals_seen
     return seen, normals, positions
-
-
-@functools.cache
-def _mesh():
-    import trimesh
-
-    shape = trimesh.load_mesh(DATA / "bunny.ply")
-    shape.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # +z up
-    shape.apply_translation(-shape.bounds.mean(axis=0))
-    return shape
 
 
 @functools.cache
@@ -101,7 +88,7 @@ def sampled(name: str, room: str, samples: int, filtered: bool = True) -> tuple[
 
     @jax.jit
     def picture(normals, positions, eye):
-        views = unit_of(eye[None] - positions)
+        views = normalize(eye[None] - positions)
         directions = 2 * jnp.sum(views * normals, axis=1, keepdims=True) * normals - views
         light = jnp.zeros((*of.seen.shape, 3)).at[row, column].set(harmonics.sample_map(texels, directions))
         if not filtered:
@@ -109,10 +96,6 @@ def sampled(name: str, room: str, samples: int, filtered: bool = True) -> tuple[
         return jnp.einsum("is,stc,jt->ijc", matrix, light, matrix, optimize=True) / coverage
 
     return picture, (of.normals[of.seen], of.positions[of.seen], of.eye)
-
-
-def unit_of(vectors):
-    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def reflected(name: str, shade: Callable) -> tuple[Callable, Callable]:
@@ -160,19 +143,6 @@ def methods(name: str, room: str, degrees: tuple[int, ...] = DEGREES) -> dict[st
 def reference(name: str, room: str) -> np.ndarray:
     picture, arguments = sampled(name, room, REFERENCE)
     return np.asarray(picture(*arguments))[images(name, SIDE).seen]
-
-
-def crops(name: str, room: str) -> dict[str, np.ndarray]:
-    """The middle of the picture [SIDE / 2, SIDE / 2, 3], linear RGB, by method; what is not seen is black."""
-    seen, found = images(name, SIDE).seen, methods(name, room, degrees=(60, 100))
-    ours = ("round, degree 100", "round, degree 100, Hann", "as it is, degree 60, Hann", "filtered maps")
-    titles = ("1 sample", "2 x 2 samples", *ours)
-    pictures = {}
-    for title, values in [(t, found[t][0]()) for t in titles] + [("16 x 16 samples", reference(name, room))]:
-        picture = np.zeros((SIDE, SIDE, 3), np.float32)
-        picture[seen] = values
-        pictures[title] = picture[SIDE // 4 : -SIDE // 4, SIDE // 4 : -SIDE // 4]
-    return pictures
 
 
 def tables(quick: bool) -> dict[str, list[dict]]:

@@ -6,18 +6,17 @@ would add, from energies alone, if visibility and the product of light and slice
 
     mean square = sum over l > L of |v_l|^2 |(E rho)_l|^2 / (2l+1), up to degree 24.
 
-Error: RMSE over the RMS of the picture with occlusion. `at each pixel` multiplies visibility and light at every pixel,
-as the paper's shader does, instead of at every vertex.
+Error: RMSE over the RMS of the picture with occlusion.
 """
 
 import functools
-import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from examples import _scene
 from shisd import decomposition, harmonics, models, reference, shading
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
@@ -32,9 +31,6 @@ LOBES, DEGREES, FINE = 16, (2, 4, 8, 12), 24
 
 def rabbit(size: int):
     """The mesh, a view of it, where its pixels' rays start, and the function that casts them."""
-    sys.path.insert(0, str(EXAMPLES))
-    import _scene
-
     file = EXAMPLES / "data" / "bunny.ply"
     shape, view = _scene.load_mesh(file), _scene.mesh(file, size, 5)
     off = 1e-4 * np.linalg.norm(np.ptp(shape.vertices, axis=0))
@@ -97,13 +93,6 @@ def tables(quick: bool) -> dict[str, list[dict]]:
                         shading.shade_environment_visibility, lobes, e[degree], v, view.normals, view.views, **where
                     )
                     for degree, v in seen.items()
-                },
-                **{
-                    ("visibility, at each pixel", f"degree {degree}"): functools.partial(
-                        shading.shade_environment_visibility, lobes, e[degree], v.at(**where), view.normals, view.views
-                    )
-                    for degree, v in seen.items()
-                    if degree == 8
                 },
                 ("ray casting", "64 rays"): lambda trace=trace: trace(64, 1).value,
             }

@@ -101,3 +101,16 @@ def slopes(brdf, wi, wo):
 
 def array(values, dtype):
     return jnp.asarray(np.asarray(values), dtype)
+
+
+def spoiled(table, rng, noise=0.1, holes=0.5):
+    """A MERL table with log-normal noise in each value, and with a share of the bins missing in all colours."""
+    noisy = np.where(table < 0, table, table * np.exp(noise * rng.standard_normal(table.shape)))
+    return np.where(rng.random(table.shape[:3])[..., None] < holes, -1.0, noisy)
+
+
+def albedos(brdf, elevations, rule):
+    """Hemispherical-directional albedo [elevations, *colour] by `hemisphere_rule(*rule)`, float32."""
+    wi, weight = (array(a, np.float32) for a in hemisphere_rule(*rule))
+    views = [jnp.broadcast_to(array(spherical(e, 0.3), np.float32), wi.shape) for e in elevations]
+    return np.stack([(weight * wi[:, 2]) @ evaluate(brdf, wi, view) for view in views])

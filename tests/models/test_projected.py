@@ -6,24 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from scipy.special import sph_harm_y
 
 from shisd import decomposition, models, shading
 from tests.models.materials import array, evaluate, hemisphere, spherical
+from tests.truth import scipy_basis
 
 DEGREE = 4
-
-
-def scipy_basis(directions, degree):
-    """Real harmonics [N, n] from SciPy's complex ones."""
-    x, y, z = np.asarray(directions, np.float64).T
-    theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
-    columns = []
-    for l in range(degree + 1):
-        for m in range(-l, l + 1):
-            value = sph_harm_y(l, abs(m), theta, phi)
-            columns.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
-    return np.stack(columns, axis=1)
 
 
 def anisotropic(rng, colour=()):

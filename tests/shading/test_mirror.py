@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from scipy.special import sph_harm_y
 
 from shisd import harmonics, shading
 from tests.hard_cases import unit
 from tests.marks import FLOAT32_FIRST, FLOAT64_FIRST
+from tests.truth import scipy_basis
 
 DEGREE = 6
 EYE = np.array([0.3, -0.2, 4.0])
@@ -170,17 +170,6 @@ def test_pixels_without_neighbours():
 # ---- filters
 
 
-def real_harmonics(directions, degree):
-    theta = np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), directions[..., 2])
-    phi = np.arctan2(directions[..., 1], directions[..., 0])
-    y = []
-    for l in range(degree + 1):
-        for m in range(-l, l + 1):
-            z = sph_harm_y(l, abs(m), theta, phi)  # with the Condon-Shortley phase
-            y.append(z.real if m == 0 else np.sqrt(2) * (z.real if m > 0 else z.imag))
-    return np.stack(y, axis=-1)
-
-
 def quadrature(e, directions, axes, degree):
     """Mean of the light over a Gaussian in the tangent plane, carried along great circles: Gauss-Hermite."""
     node, weight = np.polynomial.hermite_e.hermegauss(40)
@@ -190,7 +179,7 @@ def quadrature(e, directions, axes, degree):
     v = np.einsum("pij,zj->pzi", axes, z)
     angle = np.linalg.norm(v, axis=-1, keepdims=True)
     around = np.cos(angle) * directions[:, None] + np.sinc(angle / np.pi) * v
-    return np.einsum("z,pzn,cn->pc", w, real_harmonics(around, degree), e)
+    return np.einsum("z,pzn,cn->pc", w, scipy_basis(around, degree), e)
 
 
 def footprints(rng, major, ratio, count=12):
@@ -256,7 +245,7 @@ def test_degree_100_in_float32(rng):
     variance = np.sum(axes**2, axis=(1, 2)) / 2
     kept = np.exp(-np.outer(variance, l * (l + 1)) / 2)
     r32 = r.astype(np.float32)
-    expected = np.einsum("pn,cn->pc", kept * real_harmonics(r32.astype(float), degree), e)
+    expected = np.einsum("pn,cn->pc", kept * scipy_basis(r32.astype(float), degree), e)
     got = shading.shade_mirror(shading.MirrorFootprint(r32, axes.astype(np.float32)), e)
     np.testing.assert_allclose(got, expected, atol=5e-5 * np.max(np.abs(expected)))
 

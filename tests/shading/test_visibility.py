@@ -113,9 +113,7 @@ def test_derivatives(x64, rng):
 
     def radiance(light, coefficients, weights, normals, views):
         v = models.Visibility(coefficients, seen.triangles)
-        return shading.shade_environment_visibility(
-            lobes, light, v, normals, views, triangle=triangle, weights=weights
-        )
+        return shading.shade_environment_visibility(lobes, light, v, normals, views, triangle=triangle, weights=weights)
 
     arguments = tuple(jnp.asarray(a) for a in (e, seen.coefficients, weights, normals, views))
     check_grads(jax.jit(radiance), arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
