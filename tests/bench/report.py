@@ -24,7 +24,7 @@ GROUPS = {  # name: (title, tasks)
     "renderers": ("Whole pictures", renderers.tasks),
 }
 TABLES = {"roofline": roofline.tables, "applications": applications.tables}
-APART = ("applications",)  # only when named: `make applications`
+APART = ("applications",)  # only when named: `make applications`, and with a file of its own
 
 
 def summary(panels: dict[str, list[dict]], item: str) -> list[dict]:
@@ -114,12 +114,15 @@ def main() -> None:
         if name in wanted and (made := make(arguments.quick)):
             results[name] = made
             text = "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in made.items())
-            keep(name, f"{text}\n\n{note}", text)
+            short = f"{applications.NOTE}\n\n{table(applications.summary(made))}" if name in APART else text
+            keep(name, f"{short}\n\n{note}", text)
     report = "\n\n".join(["# Speed against error", note, *(long for _, long in sections.values())]) + "\n"
     (arguments.output / "report.json").write_text(json.dumps(results, indent=1))
     for folder in folders[:1] if arguments.only else folders:  # a part does not replace the whole
         (folder / "report.md").write_text(report)
-    for name, (short, _) in sections.items() if arguments.readme else ():
+    for name, (short, long) in sections.items() if arguments.readme else ():
+        if name in APART:
+            Path(f"examples/{name}.md").write_text(f"# {name.capitalize()}\n\n{note}\n\n{long}\n")
         if f"<!-- table:{name} -->" in Path("README.md").read_text():
             paste(name, short)
     print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")

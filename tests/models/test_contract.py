@@ -157,7 +157,7 @@ def test_derivatives_are_right_where_formulas_break(name, x64):
     size = 4 + len(jax.tree.leaves(brdf))
     lowest = np.array([min(wi[2], wo[2]) for wi, wo in cases.values()])
     step = np.full((len(cases), size), 1e-5)
-    step[:, :4] = 1e-2 * min(width, 0.1) * np.minimum(1, 3 * lowest)[:, None]  # features shrink at the horizon
+    step[:, :4] = 1e-2 * min(width, 0.02) * np.minimum(1, 3 * lowest)[:, None]  # features shrink at the horizon
 
     wi, wo = (np.stack(side) for side in zip(*cases.values(), strict=True))
     tangents = np.stack([np.stack([np.linalg.svd(w[None])[2][1:] for w in pair]) for pair in zip(wi, wo, strict=True)])
