@@ -68,6 +68,7 @@ def test_the_share_of_a_cell_against_quadrature(x64, rng):
     np.testing.assert_allclose(shares, expected, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_derivatives_add_up_to_those_of_the_solid_angle(x64, rng):
     basis, v = domains.HaarBasis(1), random_polygon(rng, 4, 0.6)
     total = lambda v: jnp.sum(basis.values(basis.project(domains.SphericalPolygon(v))) * jnp.asarray(basis.areas))

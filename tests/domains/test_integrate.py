@@ -3,12 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.test_util import check_grads
 
 from shisd import domains
 from tests import truth
 from tests.hard_cases import POLYGONS, padded, random_polygon, ring, unit
-from tests.marks import FLOAT64_FIRST
 
 
 def basis_integrals(vertices, degree, nodes):
@@ -38,13 +38,14 @@ def test_coefficients_of_hard_cases(dtype):
         np.testing.assert_allclose(got, expected, atol=tolerance * np.max(np.abs(expected)), err_msg=name)
 
 
+@pytest.mark.slow
 def test_high_degree_uses_more_axes(x64, rng):
     v = random_polygon(rng, 4, 0.4)
     got = domains.polygon_coefficients(domains.SphericalPolygon(padded(v)), 40)
     np.testing.assert_allclose(got, basis_integrals(v, 40, 30), atol=1e-13)
 
 
-@FLOAT64_FIRST
+@pytest.mark.slow
 def test_caps_and_polygons_with_many_sides_agree(dtype):
     """A 64-gon is a cap up to its missing slivers; a hemisphere and its opposite make the sphere."""
     tolerance = {"float64": 1e-13, "float32": 1e-5}[dtype.name]

@@ -10,7 +10,6 @@ from shisd import domains
 from shisd.domains import _moments
 from tests import truth
 from tests.hard_cases import POLYGONS, axes_for, padded, random_polygon, unit
-from tests.marks import FLOAT32_FIRST
 
 
 def solid_angle(vertices):
@@ -156,7 +155,7 @@ def test_powers_differentiate(x64, rng):
     )
 
 
-@FLOAT32_FIRST
+@pytest.mark.slow
 def test_high_degree_and_fold_agree(dtype, rng):
     """The loop and the unrolled sweep of the fused sum, against the moments."""
     v = jnp.asarray(np.stack([random_polygon(rng, 4, s) for s in (1.0, 0.01)]).transpose(2, 1, 0), dtype)

@@ -50,7 +50,8 @@ def test_degree_100(x64, rng):
     assert np.max(np.abs(back - c)) <= 1e-12
 
 
-@pytest.mark.parametrize("turn", [t if t == "none" else pytest.param(t, marks=pytest.mark.slow) for t in TURNS])
+@pytest.mark.slow
+@pytest.mark.parametrize("turn", TURNS)
 def test_derivatives(turn, x64, rng):
     """In the coefficients and along the group, to second order and mixed, also where the pole stays in place."""
     size = 9 if turn == "none" else 25  # the default suite compiles less

@@ -53,6 +53,7 @@ def program(code):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_values_and_gradients_of_sharded_points_are_those_of_one_device():
     program("""
 normals, views = unit(64), unit(64)

@@ -111,6 +111,7 @@ def test_diffuse_surface_in_constant_light(dtype):
     np.testing.assert_allclose(got, 0.7, rtol=3e-6)
 
 
+@pytest.mark.slow
 def test_band_limited_light_against_quadrature(x64, rng):
     """The slice integrated directly against the light, at a tabulated view: no spline, no lobes, no frame of ours."""
     brdf = models.Ggx(0.4, [0.3, 0.5, 0.9])
@@ -133,6 +134,7 @@ def test_band_limited_light_against_quadrature(x64, rng):
         np.testing.assert_allclose(got, expected, atol=2e-6 * np.max(np.abs(expected)))
 
 
+@pytest.mark.slow
 def test_views_between_the_nodes_are_interpolated_well(x64):
     """Slices at other elevations than the tabulated ones, against a finer table that has them as nodes."""
     brdf = models.Ggx(0.3, 0.04)

@@ -201,6 +201,7 @@ def test_lambertian(x64):
     assert shading.material_degree(upper, 1e-3) == 1  # cos is of degree 1 above the horizon
 
 
+@pytest.mark.slow
 def test_degree_is_the_same_from_table_and_matrix():
     table, matrix = both_of("sphere", SINGLE)
     energy = np.asarray(shading.band_energies(table), float)

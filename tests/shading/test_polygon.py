@@ -133,7 +133,7 @@ def test_hard_cases(name, dtype):
         np.testing.assert_allclose(gradient(points), gradient(points + lift), atol=2e-5 * scale)
 
 
-@FLOAT32_FIRST
+@pytest.mark.slow
 def test_light_by_direction(dtype, rng):
     """A profile at the light, and distant light through the same outline; in front, and from behind nothing."""
     position, normal, view = scene(rng, 6)

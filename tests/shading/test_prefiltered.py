@@ -62,6 +62,7 @@ def test_error_is_as_predicted(material, dtype, rng):
         assert int(shading.prefilter(lobes, e, tolerance=1e-4).channels) == 1 and not bool(filtered.mirror)
 
 
+@pytest.mark.slow
 def test_derivatives_where_frames_turn(x64, rng):
     filtered = shading.prefilter(lobes_of("glossy", np.dtype("float64")), light(rng), tolerance=1e-2)
     axis = np.concatenate([np.eye(3), -np.eye(3), unit(rng.normal(size=(3, 3)))])

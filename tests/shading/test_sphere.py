@@ -135,6 +135,7 @@ def test_inside_the_ball_light_is_all_around(x64, rng):
     assert np.all(np.isnan(shade(positions, 0.0))), "a ball of no size is an error that shows"
 
 
+@pytest.mark.slow
 def test_derivatives(x64, rng):
     lobes = random_lobes(DEGREE, np.float64)
     normals = unit(rng.normal(size=(3, 3)))

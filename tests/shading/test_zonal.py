@@ -76,6 +76,7 @@ def test_eq_24_and_reflection_maps(x64, rng):
     assert np.sqrt(np.mean(error**2)) < 5e-3 * np.sqrt(np.mean(np.square(got)))
 
 
+@pytest.mark.slow
 def test_derivatives(x64, rng):
     lobes = tabulate(MATERIALS["glossy"])
     arguments = tuple(jnp.asarray(a) for a in scene(rng, 3, np.float64)[:4])
