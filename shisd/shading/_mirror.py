@@ -46,7 +46,7 @@ def shade_mirror(
     beside the rounding of `harmonics.evaluate`. The round one leaves out the shape: 20 % where C is sixteen to one.
     Light that is cut off at a degree L rings around lamps wherever footprints are narrower than about 3 / L: take a
     higher degree, a window (`harmonics.hann_window`), or `shade_prefiltered_mirror`.
-    Cost: less than the sum over `harmonics.sh_basis`, a quarter of it from degree 30 on; anisotropic, about L^3
+    Cost: two thirds of the sum over `harmonics.sh_basis` from degree 30 on, 1.5 of it at 16; anisotropic, about L^3
     products, as in `shade_environment`.
     Memory: one tile of at most 512 pixels, and the result.
     Source: ISD15 Eq. 28, 22 and 29.
