@@ -30,7 +30,7 @@ def scalar(name: str, value: ArrayLike) -> Array:
     """`value` as one floating number."""
     array = real_array(name, value)
     if array.ndim:
-        raise ValueError(f"`{name}` must be a scalar; got shape {list(array.shape)}.")
+        raise ValueError(f"`{name}` must be a scalar; got shape {list(array.shape)}. Batch it with jax.vmap.")
     return array
 
 

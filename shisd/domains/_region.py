@@ -25,10 +25,7 @@ class SphericalCap(eqx.Module):
         a = _checks.vectors("axis", axis)
         if a.shape != (3,):
             raise ValueError(f"`axis` must have shape [3]; got {list(a.shape)}.")
-        size = _checks.real_array("angle", angle)
-        if size.shape != ():
-            raise ValueError(f"`angle` must be one number; got shape {list(size.shape)}.")
-        self.axis, self.angle = normalize(a), size.astype(a.dtype)
+        self.axis, self.angle = normalize(a), _checks.scalar("angle", angle).astype(a.dtype)
 
     @property
     def versine(self) -> Scalar:

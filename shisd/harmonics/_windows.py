@@ -48,7 +48,7 @@ def lanczos_window(degree: int, width: ArrayLike | None = None) -> Float[Array, 
 
 def _ratio(degree: int, width: ArrayLike | None) -> Float[Array, " bands"]:
     degree = _checks.degree(degree)
-    width = _scalar("width", degree + 1 if width is None else width)
+    width = _checks.scalar("width", degree + 1 if width is None else width)
     return jnp.arange(degree + 1).astype(width.dtype) / jnp.broadcast_to(width, (degree + 1,))
 
 
@@ -60,7 +60,7 @@ def laplacian_window(degree: int, strength: ArrayLike) -> Float[Array, " bands"]
     Derivatives: in `strength`, every order.
     Source: Sloan 2008.
     """
-    degree, strength = _checks.degree(degree), _scalar("strength", strength)
+    degree, strength = _checks.degree(degree), _checks.scalar("strength", strength)
     return 1 / (1 + strength * jnp.asarray(_curvature(degree), strength.dtype))
 
 
@@ -111,7 +111,7 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
     Source: Sloan 2008.
     """
     c, degree = _checks.coefficients("coefficients", coefficients)
-    floor = _scalar("floor", floor).astype(c.dtype)
+    floor = _checks.scalar("floor", floor).astype(c.dtype)
     windowed, strength, hopeless = _dering_each(c.reshape(-1, c.shape[-1]), floor, degree)
     status = WindowStatus.where(jnp.any(hopeless), WindowStatus.mean_below_floor, WindowStatus.ok)
     if throw:
@@ -230,10 +230,3 @@ def _curvature(degree: int) -> np.ndarray:
 
 def _mean(c: Float[Array, " n"]) -> Scalar:
     return c[0] * float(_tables.zonal_norms(0)[0])
-
-
-def _scalar(name: str, value: ArrayLike) -> Scalar:
-    value = _checks.real_array(name, value)
-    if value.ndim:
-        raise ValueError(f"`{name}` must be a number; got shape {list(value.shape)}. Batch it with jax.vmap.")
-    return value

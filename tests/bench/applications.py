@@ -4,6 +4,11 @@ import time
 
 from tests.bench import balls, brdf_matrix, denoise, mirror, visibility
 
+NOTE = (
+    "Error: RMSE over the RMS of the reference (rays, Gauss points, 16 x 16 samples, the slice of each view); for "
+    "measurements, RMSE over that of the noisy table. Degree 16 for shadows, 8 for BRDF matrices."
+)
+
 
 def tables(quick: bool) -> dict[str, list[dict]]:
     """Titles and rows of the tables."""
@@ -40,9 +45,3 @@ def summary(found: dict[str, list[dict]]) -> list[dict]:
                     method = f"{r['representation']}, {r['numbers stored']} numbers"
                     add("BRDF matrices", r["material"], method, r["error, view's side"], r["us/pixel"], "us/pixel")
     return lines
-
-
-NOTE = (
-    "Error: RMSE over the RMS of the reference (rays, Gauss points, 16 x 16 samples, the slice of each view); for "
-    "measurements, RMSE over that of the noisy table. Degree 16 for shadows, 8 for BRDF matrices."
-)
