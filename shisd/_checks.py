@@ -16,16 +16,22 @@ from jax.typing import ArrayLike
 from shisd._typing import Array
 
 
-def real_array(name: str, value: ArrayLike) -> Array:
-    """`value` as a floating JAX array: float32 and float64 in either byte order stay, integers become floats."""
+def any_array(name: str, value: ArrayLike) -> Array:
+    """`value` as a JAX array of any dtype that JAX has, from either byte order."""
+    came = type(value).__name__
     if isinstance(value, np.ndarray | np.generic):
-        if value.dtype.kind == "f" and value.dtype.itemsize > 8:
-            raise ValueError(f"`{name}` must hold real numbers; got dtype {value.dtype}. Pass float32 or float64.")
-        value = value.astype(value.dtype.newbyteorder("="), copy=False)
+        came = f"dtype {value.dtype}"
+        if not value.dtype.isnative:
+            value = value.astype(value.dtype.newbyteorder("="))
     try:
-        array = jnp.asarray(value)
+        return jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` must be an array of real numbers; got {type(value).__name__}.") from error
+        raise ValueError(f"`{name}` must be an array of real numbers; got {came}. Pass float32 or float64.") from error
+
+
+def real_array(name: str, value: ArrayLike) -> Array:
+    """`value` as a floating JAX array: float32 and float64 stay, integers become floats."""
+    array = any_array(name, value)
     if array.dtype in (jnp.float32, jnp.float64):
         return array
     if jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.bool_):
