@@ -8,9 +8,9 @@ import numbers
 import operator
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from shisd._typing import Array
@@ -101,7 +101,7 @@ def integer(name: str, value: object, minimum: int = 0) -> int:
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except Exception as error:  # a tracer raises JAX's own error type
-        known = " known while tracing" if isinstance(value, jax.core.Tracer) else ""
+        known = " known while tracing" if isinstance(value, Tracer) else ""
         came = repr(value) if isinstance(value, numbers.Number | str) else type(value).__name__
         raise ValueError(f"`{name}` must be a Python integer{known}; got {came}.") from error
     if number < minimum:
@@ -114,7 +114,7 @@ def require(value: Array, good: ArrayLike, message: str) -> Array:
 
     What is known is judged here and not by `eqx.error_if`, whose message stands among twenty lines of others.
     """
-    if isinstance(good, jax.core.Tracer):
+    if isinstance(good, Tracer):
         return eqx.error_if(value, ~jnp.all(good), message)
     if not np.all(good):
         raise ValueError(message)

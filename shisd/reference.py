@@ -3,7 +3,8 @@
 They share no formula with them: no harmonics, no expansion, no closed form. Radiance is the integral over the upper
 hemisphere of value_cosine(wi, wo) times the map's radiance, constant on each texel, taken two ways: by Monte Carlo with
 multiple importance sampling (Veach 1995, balance heuristic) for whole pictures, and by a plain sum over texels for a
-few pixels. Of polygons, the integral is over their area: by Monte Carlo, and by Gauss quadrature of what is above the horizon.
+few pixels. Of polygons, the integral is over their area: by Monte Carlo, and by Gauss quadrature of what is above the
+horizon.
 """
 
 import functools

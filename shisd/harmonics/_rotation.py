@@ -112,7 +112,8 @@ def _rotate_many_away_from_pole(c: Array, r: Float[Array, "p 3 3"], degree: int)
 
 def turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
     """Cosines and sines [L+1, p] of the multiples of the three angles of each rotation."""
-    cos, sin = angle_multiples(*(jnp.stack(parts) for parts in zip(*_angles(r), strict=True)), degree + 1)
+    cos, sin = (jnp.stack(parts) for parts in zip(*_angles(r), strict=True))
+    cos, sin = angle_multiples(cos, sin, degree + 1)
     return [[cos[:, i], sin[:, i]] for i in range(3)]
 
 

@@ -20,6 +20,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
 
 from shisd import _checks
@@ -95,7 +96,7 @@ def project(
         return _by_rule(function, degree, rule)[0]
     rule = max(2 * degree, 64)
     coarse, _ = _by_rule(function, degree, rule)
-    if isinstance(coarse, jax.core.Tracer):
+    if isinstance(coarse, Tracer):
         rule = max(4 * degree, 256)
         coarse, _ = _by_rule(function, degree, rule // 2)
         fine, scale = _by_rule(function, degree, rule)

@@ -113,7 +113,8 @@ class Environment(eqx.Module):
         """The solid angle of one texel of each row, in sr, exact; times W they sum to 4 pi."""
         height = len(self.texels)
         step = np.pi / height
-        angles = 2 * np.sin(step * (np.arange(height) + 0.5)) * np.sin(step / 2) * (2 * np.pi / (2 * height))
+        from_pole = np.minimum(np.arange(height), np.arange(height)[::-1]) + 0.5
+        angles = 2 * np.sin(step * from_pole) * np.sin(step / 2) * step
         return jnp.asarray(angles, self.texels.dtype)
 
     def coefficients(self, degree: int, *, texels: Literal["cells", "samples"] = "cells") -> Float[Array, "*colour n"]:
