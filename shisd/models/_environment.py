@@ -146,7 +146,7 @@ def _as_radiance(texels: np.ndarray, path: str, bad_texels: str) -> np.ndarray:
     kinds = {"NaN": (np.isnan(texels), 0), "infinite": (np.isposinf(texels), largest), "negative": (texels < 0, 0)}
     total, found, done = texels.shape[0] * texels.shape[1], [], []
     for name, (bad, value) in kinds.items():
-        if count := np.sum(np.any(bad.reshape(total, -1), axis=1)):
+        if count := int(np.sum(np.any(bad.reshape(total, -1), axis=1))):
             found.append(f"{count} {name} texel{'s' * (count > 1)}")
             done.append(f"{found[-1]} set to {value:.6g}")
     if not found:
