@@ -143,7 +143,7 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
     emitters = {
         name: (covers(points, flat), emission / emission.max()) for name, (points, emission) in lights().items()
     }
-    emitters["window"] = covers(window(), flat), np.asarray(outside.radiance(flat.astype(np.float32)))
+    emitters["window"] = covers(window(), flat), np.asarray(outside.radiance(flat.astype(np.float32), texels="samples"))
     show = lambda values, name: picture(values, {k: v for k, v in emitters.items() if name in (k, "all")}, shape)
     panels = {}
     for name in [*names, "all"]:

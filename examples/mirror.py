@@ -31,7 +31,7 @@ def sampled(name: str, environment: models.Environment, size: int, samples: int)
     """The picture [size, size, 3] from samples^2 rays for each pixel, averaged with the filter over what is seen."""
     view, _ = look(name, size * samples)
     facing = np.sum(view.normals * view.views, axis=1, keepdims=True)
-    light = view.picture(np.asarray(environment.radiance(2 * facing * view.normals - view.views)))
+    light = view.picture(np.asarray(environment.radiance(2 * facing * view.normals - view.views, texels="samples")))
     at = (np.arange(size * samples) + 0.5) / samples - (np.arange(size)[:, None] + 0.5)
     weights = np.where(np.abs(at) <= 1.5, np.exp(-(at**2) / (2 * WIDTH**2)), 0)
     average = lambda image: np.einsum("is,st...,jt->ij...", weights, image, weights, optimize=True)
@@ -50,7 +50,7 @@ def run(output: Path, size: int) -> list[dict]:
             light = harmonics.apply_window(environment.coefficients(DEGREE), harmonics.hann_window(DEGREE))
             truth = sampled(name, environment, size, MANY)
             images = {
-                "1 sample": environment.radiance(footprint.directions),
+                "1 sample": environment.radiance(footprint.directions, texels="samples"),
                 f"{SAMPLES} x {SAMPLES} samples": sampled(name, environment, size, SAMPLES),
                 "round Gaussian": shading.shade_mirror(footprint, light),
                 "filtered maps": shading.shade_prefiltered_mirror(footprint, maps),

@@ -145,7 +145,7 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
     gallery = []  # every object, room and material at the highest degree
     for shape, light in tqdm(list(itertools.product(shapes, environments)), "pictures"):
         view, exposure = shapes[shape], MAPS[light][1]
-        background = np.asarray(environments[light].radiance(view.rays.astype(np.float32)))
+        background = np.asarray(environments[light].radiance(view.rays.astype(np.float32), texels="samples"))
         show = lambda values, v=view, b=background, e=exposure: io.tonemap(v.picture(values, b), exposure=e)
         panels = {}
         for material in brdfs:

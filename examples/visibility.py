@@ -47,7 +47,7 @@ def run(output: Path, size: int, samples: int, rays: int, seed: int) -> list[dic
             key=jax.random.key(seed), samples=samples, positions=starts, visible=visible,
         )  # fmt: skip
         images["rays"], noise2 = truth.value, np.mean(np.asarray(truth.standard_error, float) ** 2)
-        background = np.asarray(environment.radiance(view.rays.astype(np.float32)))
+        background = np.asarray(environment.radiance(view.rays.astype(np.float32), texels="samples"))
         gallery.append(np.concatenate([
             io.tonemap(view.picture(np.asarray(image), background), exposure=exposure) for image in images.values()
         ], axis=1))  # fmt: skip

@@ -4,22 +4,35 @@ Shapes, types and static arguments are known while tracing, so these checks cost
 """
 
 import math
+import numbers
 import operator
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from shisd._typing import Array
 
 
+def any_array(name: str, value: ArrayLike) -> Array:
+    """`value` as a JAX array of any dtype that JAX has, from either byte order."""
+    came = type(value).__name__
+    if isinstance(value, np.ndarray | np.generic):
+        came = f"dtype {value.dtype}"
+        if not value.dtype.isnative:
+            value = value.astype(value.dtype.newbyteorder("="))
+    try:
+        return jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` must be an array of real numbers; got {came}. Pass float32 or float64.") from error
+
+
 def real_array(name: str, value: ArrayLike) -> Array:
     """`value` as a floating JAX array: float32 and float64 stay, integers become floats."""
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` must be an array of real numbers; got {type(value).__name__}.") from error
-    if jnp.issubdtype(array.dtype, jnp.floating):
+    array = any_array(name, value)
+    if array.dtype in (jnp.float32, jnp.float64):
         return array
     if jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.bool_):
         return array.astype(float)
@@ -88,11 +101,24 @@ def integer(name: str, value: object, minimum: int = 0) -> int:
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except Exception as error:  # a tracer raises JAX's own error type
-        message = f"`{name}` must be a Python integer known while tracing; got {type(value).__name__}."
-        raise ValueError(message) from error
+        known = " known while tracing" if isinstance(value, Tracer) else ""
+        came = repr(value) if isinstance(value, numbers.Number | str) else type(value).__name__
+        raise ValueError(f"`{name}` must be a Python integer{known}; got {came}.") from error
     if number < minimum:
         raise ValueError(f"`{name}` must be >= {minimum}; got {number}.")
     return number
+
+
+def require(value: Array, good: ArrayLike, message: str) -> Array:
+    """`value`, where all of `good` is true. Where it is not, a ValueError at once, or under jit an error at run time.
+
+    What is known is judged here and not by `eqx.error_if`, whose message stands among twenty lines of others.
+    """
+    if isinstance(good, Tracer):
+        return eqx.error_if(value, ~jnp.all(good), message)
+    if not np.all(good):
+        raise ValueError(message)
+    return value
 
 
 def degree(value: object) -> int:

@@ -39,7 +39,7 @@ def angle_multiples(
 
 def _chain(cos: Array, sin: Array, count: int) -> tuple[list[Array], list[Array]]:
     """The first `count` powers by halving: power k is the product of powers k // 2 and k - k // 2."""
-    c, s = [jnp.ones_like(cos), cos], [jnp.zeros_like(sin), sin]
+    c, s = [1 + 0 * cos, cos], [0 * sin, sin]  # NaN also of the angle that is not a number
     for k in range(2, count):
         i, j = k // 2, k - k // 2
         c.append(c[i] * c[j] - s[i] * s[j])

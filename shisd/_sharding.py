@@ -14,11 +14,12 @@ from jax.sharding import NamedSharding, PartitionSpec
 from shisd._typing import Array
 
 
-def by_device(function: Callable[..., Array], batch: dict[str, Array], *shared: Any) -> Array:
+def by_device(function: Callable[..., Any], batch: dict[str, Array], *shared: Any) -> Any:
     """function(batch, *shared), on every device for its own part of the batch.
 
     The leading axes of the arrays [..., k] in `batch` broadcast, and are the leading axes of the result. `shared` is
-    whole on every device; its gradient is one sum over the devices. `function` is static: no lambda or closure.
+    whole on every device; its gradient is one sum over the devices. `function` is static: no lambda or closure. It may
+    return several arrays.
     """
     rank = max(a.ndim for a in batch.values()) - 1
     axes: list[Any] = [None] * rank
@@ -38,7 +39,7 @@ def by_device(function: Callable[..., Array], batch: dict[str, Array], *shared: 
 
 
 @eqx.filter_jit
-def _by_device(function: Callable[..., Array], batch: dict[str, Array], shared: Any, axes: tuple, mesh: Any) -> Array:
+def _by_device(function: Callable[..., Any], batch: dict[str, Array], shared: Any, axes: tuple, mesh: Any) -> Any:
     def spec(a: Array) -> PartitionSpec:
         own = axes[len(axes) - a.ndim + 1 :]
         return PartitionSpec(*(axis if n > 1 else None for axis, n in zip(own, a.shape[:-1], strict=True)), None)

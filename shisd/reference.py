@@ -1,9 +1,10 @@
 """Slow, plainly right estimators with error bars, to judge the fast paths by.
 
 They share no formula with them: no harmonics, no expansion, no closed form. Radiance is the integral over the upper
-hemisphere of value_cosine(wi, wo) times the map's bilinear radiance, taken two ways: by Monte Carlo with multiple
-importance sampling (Veach 1995, balance heuristic) for whole pictures, and by a plain sum over texels for a few pixels.
-Of polygons, the integral is over their area: by Monte Carlo, and by Gauss quadrature of what is above the horizon.
+hemisphere of value_cosine(wi, wo) times the map's radiance, constant on each texel, taken two ways: by Monte Carlo with
+multiple importance sampling (Veach 1995, balance heuristic) for whole pictures, and by a plain sum over texels for a
+few pixels. Of polygons, the integral is over their area: by Monte Carlo, and by Gauss quadrature of what is above the
+horizon.
 """
 
 import functools
@@ -199,10 +200,9 @@ def _strata(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _MapDensity(eqx.Module):
-    """A density on the sphere that follows a bilinear map, up to sin(theta) inside a texel: a mixture of tents.
+    """A density on the sphere that follows a map, up to sin(theta) inside a texel.
 
-    A texel is chosen by its power, then a point of the tent-shaped weight that it has in bilinear interpolation. In the
-    plane of theta and phi the density is then the bilinear interpolant of the texels' probabilities.
+    A texel is chosen by its power, then a point of it, uniformly in theta and phi.
     """
 
     row_cdf: Array  # [1, H + 1]
@@ -214,8 +214,7 @@ class _MapDensity(eqx.Module):
         row, down = _invert(self.row_cdf, jnp.zeros(u.shape[:-1], int), u[..., 0])
         column, along = _invert(self.column_cdf, row, u[..., 1])
         step = np.pi / len(self.column_cdf)
-        theta = step * (row.astype(u.dtype) + 0.5 + _tent(down))  # a theta below 0 or above pi crosses the pole
-        phi = step * (column.astype(u.dtype) + 0.5 + _tent(along))
+        theta, phi = step * (row.astype(u.dtype) + down), step * (column.astype(u.dtype) + along)
         return _polar(jnp.cos(theta), jnp.sin(theta), phi)
 
     def __call__(self, directions: Array) -> Array:
@@ -234,11 +233,6 @@ def _map_density(environment: Environment) -> _MapDensity:
     column_cdf = _cdf(jnp.where(rows[:, None] > 0, mass, jnp.ones_like(mass)))
     probability = jnp.diff(row_cdf[0])[:, None] * jnp.diff(column_cdf)  # of the rounded tables, which are sampled
     return _MapDensity(row_cdf, column_cdf, Environment(probability / (np.pi / len(mass)) ** 2))
-
-
-def _tent(u: Array) -> Array:
-    """A point of (-1, 1) of density 1 - |t| from a uniform number."""
-    return jnp.where(u < 0.5, jnp.sqrt(2 * u) - 1, 1 - jnp.sqrt(2 * (1 - u)))
 
 
 def _cdf(mass: Array) -> Array:
@@ -361,17 +355,19 @@ def _quadrature(brdf: AbstractBrdf, environment: Environment, frames: Array, vie
     phi = 2 * np.pi * (np.arange(width) + 0.5) / width
     solid_angles = jnp.asarray(2 * np.pi / width * 2 * np.sin(theta) * np.sin(np.pi / height / 2), views.dtype)
     cosines, sines = jnp.asarray(np.cos(theta), views.dtype), jnp.asarray(np.sin(theta), views.dtype)
+    texels = np.arange(height, dtype=np.int32) // supersampling
     circle = jnp.asarray(np.stack([np.cos(phi), np.sin(phi)], axis=-1), views.dtype)
 
     def one(point: tuple[Array, Array]) -> Array:
         frame, wo = point
 
-        def row(part: tuple[Array, Array, Array]) -> Array:
-            cosine, sine, solid_angle = part
+        def row(part: tuple[Array, ...]) -> Array:
+            cosine, sine, solid_angle, texel = part
             world = jnp.concatenate([sine * circle, jnp.full_like(circle[:, :1], cosine)], axis=1)
-            return solid_angle * jnp.sum(_integrand(brdf, environment.radiance, frame, wo, world @ frame.T), axis=0)
+            light = jnp.repeat(environment.texels[texel], supersampling, axis=0)
+            return solid_angle * jnp.sum(_integrand(brdf, lambda _: light, frame, wo, world @ frame.T), axis=0)
 
-        return jnp.sum(jax.lax.map(row, (cosines, sines, solid_angles)), axis=0)
+        return jnp.sum(jax.lax.map(row, (cosines, sines, solid_angles, texels)), axis=0)
 
     return jax.lax.map(one, (frames, views))
 

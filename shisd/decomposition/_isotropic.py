@@ -192,7 +192,8 @@ class IsotropicBasis(eqx.Module):
 
         def one(w: Float[Array, "l k"], z: Float[Array, "*levels k 3"]) -> Array:
             z = jnp.broadcast_to(z, (*w.shape, 3))
-            return jnp.einsum("lk,lk...->...", w, jax.vmap(sample_map)(texels, z))
+            look_up = jax.vmap(lambda image, at: sample_map(image, at, texels="samples"))
+            return jnp.einsum("lk,lk...->...", w, look_up(texels, z))
 
         return self._turned(one, weights, rotations, texels.dtype)
 

@@ -75,10 +75,7 @@ def _turn(c: Float[Array, "*batch n"], back: bool) -> Float[Array, "*batch n"]:
 
 
 def _complex_coefficients(value: ArrayLike) -> Array:
-    try:
-        c = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`coefficients` must be an array of numbers; got {type(value).__name__}.") from error
+    c = _checks.any_array("coefficients", value)
     if not jnp.issubdtype(c.dtype, jnp.complexfloating):
         raise ValueError(f"`coefficients` must be complex where `source` is 'scipy'; got dtype {c.dtype}.")
     _degree(c.real)

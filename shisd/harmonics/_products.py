@@ -14,6 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import _quadrature, _tables, _transform
 
@@ -27,23 +28,28 @@ def multiply(a: ArrayLike, b: ArrayLike, degree: int) -> Float[Array, "*batch n"
     Accuracy: 1e-14 in float64 and 1e-6 in float32 of the product of the norms at degree 16.
     Cost: two syntheses and one analysis on (La + Lb + degree)^2 / 2 points.
     """
-    a, degree_a = _checks.coefficients("a", a)
-    b, degree_b = _checks.coefficients("b", b)
+    (a, _), (b, _) = _checks.coefficients("a", a), _checks.coefficients("b", b)
     degree = _checks.degree(degree)
     dtype = jnp.promote_types(a.dtype, b.dtype)
     try:
-        shape = np.broadcast_shapes(a.shape[:-1], b.shape[:-1])
+        np.broadcast_shapes(a.shape[:-1], b.shape[:-1])
     except ValueError as error:
         raise ValueError(f"batch axes of `a` {list(a.shape)} and `b` {list(b.shape)} do not broadcast.") from error
-    kept = min(degree, degree_a + degree_b)
-    rows, columns = _grid(degree_a + degree_b + kept)
+    return by_device(_multiply, {"a": a.astype(dtype), "b": b.astype(dtype)}, degree)
+
+
+def _multiply(batch: dict[str, Array], degree: int) -> Float[Array, "*batch n"]:
+    a, b = batch["a"], batch["b"]
+    top = _checks.degree_of(a.shape[-1]) + _checks.degree_of(b.shape[-1])
+    kept, rank = min(degree, top), max(a.ndim, b.ndim) - 1
+    rows, columns = _grid(top + kept)
 
     def on_grid(c: Array) -> Array:
-        values = _transform.synthesize(c.astype(dtype), "gauss", rows, columns)
-        return values.reshape(rows, columns, *[1] * (len(shape) + 1 - c.ndim), *c.shape[:-1])
+        values = _transform.synthesize(c, "gauss", rows, columns)
+        return values.reshape(rows, columns, *[1] * (rank + 1 - c.ndim), *c.shape[:-1])
 
     product = _transform.analyse(on_grid(a) * on_grid(b), "gauss", kept)
-    return jnp.pad(product, (*((0, 0),) * len(shape), (0, (degree + 1) ** 2 - (kept + 1) ** 2)))
+    return jnp.pad(product, (*((0, 0),) * rank, (0, (degree + 1) ** 2 - (kept + 1) ** 2)))
 
 
 def product_matrix(

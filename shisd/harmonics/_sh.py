@@ -107,7 +107,7 @@ def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]
     polar = theta.T @ series
     # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
     azimuth = phi.T @ factors
-    return (polar * azimuth[:, _tables.orders(degree) + degree]).reshape(*u.shape[:-1], -1)
+    return (polar * azimuth[:, _tables.orders(degree) + degree]).reshape(*u.shape[:-1], (degree + 1) ** 2)
 
 
 def weighted_sums(values: Float[Array, "*p_f"], u: Float[Array, "p 3"], degree: int) -> Float[Array, "*f_n"]:
@@ -169,7 +169,8 @@ def _expand(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) ->
         z, rho, *phi = _angles(u)
         cos_phi, sin_phi = (a[None] for a in phi)
         cos, sin = angle_multiples(z, rho, degree + 1)
-        e, o = (w.reshape(c.shape[0], 2, -1, u.shape[0]) for w in (even @ cos, odd @ sin))
+        waves = ((even @ cos, degree // 2 + 1), (odd @ sin, (degree + 1) // 2))
+        e, o = (w.reshape(c.shape[0], 2, orders, u.shape[0]) for w, orders in waves)
         x, y = jnp.zeros((2, c.shape[0], u.shape[0]), c.dtype)
         for m in range(degree, -1, -1):  # Horner's rule for the real part of sum (e_m - i e_-m) exp(i m phi)
             wave = (o if m % 2 else e)[:, :, m // 2]
@@ -200,8 +201,10 @@ def _expand_jvp(degree, primals, tangents):
             sum(jnp.asarray(factor[None, :], c.dtype) * c[:, index] for index, factor in terms)
             for terms in _tables.gradient_gather(degree, transpose=True)
         ]
-        slopes = _expand(jnp.concatenate(gradients), u, degree - 1).reshape(3, c.shape[0], -1)
+        slopes = _expand(jnp.concatenate(gradients), u, degree - 1).reshape(3, *values.shape)
         dvalues += jnp.sum(slopes * du.T[:, None, :], axis=0)
+    elif not isinstance(du, SymbolicZero):
+        dvalues += 0 * (u * du).T[:1]  # NaN where u is
     return values, dvalues
 
 

@@ -20,64 +20,123 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
 
 from shisd import _checks
+from shisd._numerics import normalize
+from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import _quadrature, _tables
 
-Rows = Literal["gauss", "fejer"]
+Rows = Literal["gauss", "fejer", "cells"]
+Texels = Literal["cells", "samples"]
+_FINEST = 2048  # quadrature degree at which `project` gives up: 2 million directions
 
 
-def project_map(texels: ArrayLike, degree: int) -> Float[Array, "*colour n"]:
+def project_map(image: ArrayLike, degree: int, *, texels: Texels = "cells") -> Float[Array, "*colour n"]:
     """Spherical-harmonic coefficients of an equirectangular map.
 
-    Arguments: `texels` [H, W, *colour], pixel-centred: row j at theta = pi (j + 1/2)/H (row 0 next to +z), column i at
-    phi = 2 pi (i + 1/2)/W from +x towards +y; static `degree` L < min(H, W/2). Returns [*colour, (L+1)^2] in the dtype
-    of `texels`. A texel that is not finite makes every coefficient of its colour NaN: clean the map first.
-    Exact for a map band-limited to degree M when M < H and L + M < W. Of any other map, the coefficients are those of
-    its trigonometric interpolant in the polar angle.
-    Derivatives: linear in `texels`.
+    Arguments: `image` [H, W, *colour], whose texel (j, i) has its centre at theta = pi (j + 1/2)/H (row 0 touches +z)
+    and phi = 2 pi (i + 1/2)/W from +x towards +y; static `degree` L; static `texels`, what a texel is:
+    - "cells", the mean over its cell, as in photographs and renderings. The function that is constant on each cell is
+      integrated exactly, at any degree: sqrt(4 pi) times coefficient 0 is the sum of texels times solid angles.
+    - "samples", the value of a smooth function at its centre, as `synthesize_map` gives it: exact for a map
+      band-limited to degree M when M < H and L + M < W. Of any other map, the coefficients are those of its
+      trigonometric interpolant in the polar angle, which has another power next to the poles. L < min(H, W/2).
+    Returns [*colour, (L+1)^2] in the dtype of `image`. A texel that is not finite makes every coefficient of its colour
+    NaN: clean the map first.
+    Derivatives: linear in `image`.
     Accuracy: 1e-13 of the largest coefficient at degree 128 in float64, 3e-7 in float32.
     Cost: one FFT (or a small matrix product) per row, and a product over half the rows; measured by `make bench`.
     """
-    texels, degree = _checks.real_array("texels", texels), _checks.degree(degree)
-    if texels.ndim < 2 or 0 in texels.shape:
-        raise ValueError(f"`texels` must have shape [H, W, *colour]; got {list(texels.shape)}.")
-    height, width = texels.shape[:2]
+    image, degree = _checks.real_array("image", image), _checks.degree(degree)
+    if image.ndim < 2 or 0 in image.shape[:2]:
+        raise ValueError(f"`image` must have shape [H, W, *colour]; got {list(image.shape)}.")
+    height, width = image.shape[:2]
     largest = min(height - 1, (width - 1) // 2)
-    if degree > largest:
-        raise ValueError(f"`degree` {degree} is too high for {height} x {width} texels; pass {largest} or less.")
-    return analyse(texels, "fejer", degree)
+    check_texels(texels)
+    if texels == "samples" and degree > largest:
+        raise ValueError(f"`degree` {degree} is too high for {height} x {width} samples; pass {largest} or less.")
+    return analyse(image, "cells" if texels == "cells" else "fejer", degree)
+
+
+def check_texels(texels: object) -> None:
+    if texels not in ("cells", "samples"):
+        raise ValueError(f'`texels` must be "cells" or "samples"; got {texels!r}.')
 
 
 def project(
-    function: Callable[[Array], ArrayLike], degree: int, *, quadrature_degree: int | None = None
+    function: Callable[[Array], ArrayLike],
+    degree: int,
+    *,
+    quadrature_degree: int | None = None,
+    tolerance: float = 1e-3,
 ) -> Float[Array, "*colour n"]:
     """Spherical-harmonic coefficients of a function of direction.
 
     Arguments: `function` maps unit directions [N, 3], in JAX's default float, to values [N] or [N, *colour]; static
     `degree` L. Returns [*colour, (L+1)^2] in the dtype of the values.
-    `quadrature_degree` >= 2 L, the degree of the product rule, is 2 L unless given: exact for functions band-limited to
-    L. Raise it for rough functions: what lies above degree `quadrature_degree` - L is aliased into the result.
+    The product rule is made finer, its degree doubled from max(2 L, 64) on, until no coefficient changes by more than
+    `tolerance` times the mean of |function| times sqrt(4 pi) (for light, the largest coefficient of band 0); then the
+    finer rule's are returned. ValueError where degree 2048 is not enough, as for steps and narrow peaks. What is so
+    narrow that both of the first rules miss it, below 3 degrees across, is not seen. Under `jax.jit`, where no value is
+    known, the rule is that of degree 256, or 4 L if that is more, and an error at run time says that it changes too
+    much against half of it.
+    `quadrature_degree` >= 2 L sets the degree of the rule instead, and nothing is compared: 2 L is exact for functions
+    band-limited to L, otherwise what lies above degree `quadrature_degree` - L is aliased into the result.
     Derivatives: in whatever `function` is differentiable in, through its values.
-    Cost: (quadrature_degree + 1)^2 / 2 directions.
+    Cost: (q + 1)^2 / 2 directions for a rule of degree q.
     """
     degree = _checks.degree(degree)
-    rule_degree = 2 * degree if quadrature_degree is None else _checks.integer("quadrature_degree", quadrature_degree)
-    if rule_degree < 2 * degree:
-        raise ValueError(f"`quadrature_degree` must be >= 2 * degree = {2 * degree}; got {rule_degree}.")
-    directions, _ = _quadrature.sphere_rule(rule_degree)
+    if quadrature_degree is not None:
+        rule = _checks.integer("quadrature_degree", quadrature_degree)
+        if rule < 2 * degree:
+            raise ValueError(f"`quadrature_degree` must be >= 2 * degree = {2 * degree}; got {rule}.")
+        return _by_rule(function, degree, rule)[0]
+    rule = max(2 * degree, 64)
+    coarse, _ = _by_rule(function, degree, rule)
+    if isinstance(coarse, Tracer):
+        rule = max(4 * degree, 256)
+        coarse, _ = _by_rule(function, degree, rule // 2)
+        fine, scale = _by_rule(function, degree, rule)
+        message = f"`project` has not converged to `tolerance` {tolerance} at quadrature degree {rule}: pass a higher"
+        return _checks.require(fine, ~(_change(fine, coarse, scale) > tolerance), f"{message} `quadrature_degree`.")
+    while True:
+        rule *= 2
+        fine, scale = _by_rule(function, degree, rule)
+        change = float(_change(fine, coarse, scale))
+        if not change > tolerance:  # also where it is NaN
+            return fine
+        if 2 * rule > max(_FINEST, 8 * degree):
+            raise ValueError(
+                f"`project` has not converged: from quadrature degree {rule // 2} to {rule}, coefficients change by "
+                f"{change:.1e} of the mean, above `tolerance` {tolerance}. Pass tolerance={2 * change:.1e}, or "
+                f"quadrature_degree={2 * rule}."
+            )
+        coarse = fine
+
+
+def _by_rule(function: Callable[[Array], ArrayLike], degree: int, rule: int) -> tuple[Array, Array]:
+    """Coefficients by the product rule of degree `rule`, and the integral of |function| over sqrt(4 pi), [*colour]."""
+    directions, weights = _quadrature.sphere_rule(rule)
     values = _checks.real_array("function(directions)", function(directions))
     if values.ndim == 0 or values.shape[0] != directions.shape[0]:
         raise ValueError(
             f"`function` must return [{directions.shape[0]}, *colour] for as many directions; got {list(values.shape)}."
         )
-    return analyse(values.reshape(rule_degree // 2 + 1, rule_degree + 1, *values.shape[1:]), "gauss", degree)
+    scale = jnp.tensordot(weights.astype(values.dtype), jnp.abs(values), 1) / np.sqrt(4 * np.pi)
+    return analyse(values.reshape(rule // 2 + 1, rule + 1, *values.shape[1:]), "gauss", degree), scale
+
+
+@jax.jit
+def _change(fine: Float[Array, "*f n"], coarse: Float[Array, "*f n"], scale: Float[Array, "*f"]) -> Array:
+    return jnp.max(jnp.max(jnp.abs(fine - coarse), axis=-1) / jnp.where(scale > 0, scale, 1), initial=0)
 
 
 def synthesize_map(coefficients: ArrayLike, height: int, width: int | None = None) -> Float[Array, "h w *colour"]:
-    """The equirectangular map of an expansion: its values at the texel centres of `project_map`, whose inverse it is.
+    """The equirectangular map of an expansion: its values at the texel centres, of which `project_map` with
+    texels="samples" is the inverse.
 
     Arguments: `coefficients` [*colour, (L+1)^2]; static `height` and `width`, 2 * height unless given, at any size.
     Returns [height, width, *colour].
@@ -89,37 +148,54 @@ def synthesize_map(coefficients: ArrayLike, height: int, width: int | None = Non
     return synthesize(c, "fejer", height, width)
 
 
-def sample_map(texels: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch_and_colour"]:
-    """Values of an equirectangular map [H, 2H, *colour] at `directions` [..., 3]: [..., *colour], bilinear in texels.
+def sample_map(
+    image: ArrayLike, directions: ArrayLike, *, texels: Texels = "cells"
+) -> Float[Array, "*batch_and_colour"]:
+    """Values of an equirectangular map [H, W, *colour] at `directions` [..., 3]: [..., *colour].
 
-    phi wraps around; next to a pole the row beyond is the same row half a turn away. Directions of any length are
-    accepted. Output dtype is that of the directions. Derivatives: in texels and directions; those in directions jump
-    between texels. At a pole itself phi is taken as 0 and derivatives in directions are zero.
+    Static `texels` as in `project_map`: of "cells", the texel that the direction is in, so that the integral over a
+    cell is its texel times its solid angle; of "samples", bilinear between texel centres, where phi wraps around and
+    the row beyond a pole is the same row half a turn away (W even).
+    Directions of any length are accepted; a zero vector or one that is not finite gives NaN. At a pole itself phi is
+    taken as 0. Output dtype is that of the directions. Derivatives: in `image` and directions. Those in directions are
+    0 in cells; between samples they jump from texel to texel, and are 0 at a pole itself.
     """
-    texels, w = _checks.real_array("texels", texels), _checks.vectors("directions", directions)
-    if texels.ndim not in (2, 3):
-        raise ValueError(f"`texels` must have shape [H, W] or [H, W, colour]; got {list(texels.shape)}.")
-    height, width = texels.shape[:2]
+    image, w = _checks.real_array("image", image), _checks.vectors("directions", directions)
+    if image.ndim not in (2, 3) or 0 in image.shape[:2]:
+        raise ValueError(f"`image` must have shape [H, W] or [H, W, colour]; got {list(image.shape)}.")
+    check_texels(texels)
+    if texels == "samples" and image.shape[1] % 2:
+        raise ValueError(f"`image` must have an even width, to be continued across the poles; got {list(image.shape)}.")
+    return by_device(_sample, {"directions": w}, image, texels)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _sample(batch: dict[str, Array], image: Array, texels: Texels) -> Array:
+    w = normalize(batch["directions"])
+    height, width = image.shape[:2]
     x, y, z = w[..., 0], w[..., 1], w[..., 2]
     sine2 = x * x + y * y
-    off_pole = sine2 > 0
-    sine = jnp.where(off_pole, jnp.sqrt(jnp.where(off_pole, sine2, 1)), 0)
-    theta = jnp.where(off_pole, jnp.arctan2(sine, z), jnp.where(z < 0, np.pi, 0).astype(z.dtype))
-    phi = jnp.arctan2(jnp.where(off_pole, y, 0), jnp.where(off_pole, x, 1))
-    row, v = _split(theta * (height / np.pi) - 0.5)
-    column, u = _split(phi * (width / (2 * np.pi)) - 0.5)
+    at_pole = sine2 == 0
+    sine = jnp.where(at_pole, 0, jnp.sqrt(jnp.where(at_pole, 1, sine2)))
+    theta = jnp.where(at_pole, jnp.where(z < 0, np.pi, 0).astype(z.dtype), jnp.arctan2(sine, z))
+    phi = jnp.arctan2(jnp.where(at_pole, 0, y), jnp.where(at_pole, 1, x))
 
     def texel(row: Array, column: Array) -> Array:
         beyond = (row < 0) | (row >= height)  # across a pole
         column = jnp.where(beyond, column + width // 2, column) % width
-        value = texels[jnp.clip(row, 0, height - 1), column].astype(w.dtype)
+        value = image[jnp.clip(row, 0, height - 1), column].astype(w.dtype)
         return value if value.ndim > row.ndim else value[..., None]
 
-    u, v = u[..., None], v[..., None]
-    upper = (1 - u) * texel(row, column) + u * texel(row, column + 1)
-    lower = (1 - u) * texel(row + 1, column) + u * texel(row + 1, column + 1)
-    value = (1 - v) * upper + v * lower
-    return value if texels.ndim == 3 else value[..., 0]
+    if texels == "cells":
+        (row, v), (column, u) = _split(theta * (height / np.pi)), _split(phi * (width / (2 * np.pi)))
+        value = texel(jnp.clip(row, 0, height - 1), column) + 0 * (u + v)[..., None]  # NaN of NaN
+    else:
+        (row, v), (column, u) = _split(theta * (height / np.pi) - 0.5), _split(phi * (width / (2 * np.pi)) - 0.5)
+        u, v = u[..., None], v[..., None]
+        upper = (1 - u) * texel(row, column) + u * texel(row, column + 1)
+        lower = (1 - u) * texel(row + 1, column) + u * texel(row + 1, column + 1)
+        value = (1 - v) * upper + v * lower
+    return value if image.ndim == 3 else value[..., 0]
 
 
 def _split(position: Float[Array, "*batch"]) -> tuple[Array, Array]:
@@ -132,7 +208,7 @@ def analyse(values: Float[Array, "rows columns *f"], rule: Rows, degree: int) ->
     """Coefficients of functions on a grid: rows of the rule, columns at the azimuths 2 pi (i + 1/2) / columns."""
     rows, columns = values.shape[:2]
     tables = (
-        _azimuth_table(columns, degree, values.dtype),
+        _azimuth_table(columns, degree, values.dtype, rule == "cells"),
         _row_table(rule, rows, degree, values.dtype, columns),
         _series_table(degree, values.dtype),
     )
@@ -143,7 +219,7 @@ def synthesize(c: Float[Array, "*f n"], rule: Rows, rows: int, columns: int) -> 
     """Values of expansions on a grid: the same rows and columns."""
     _, degree = _checks.coefficients("coefficients", c)
     tables = (
-        _azimuth_table(columns, degree, c.dtype),
+        _azimuth_table(columns, degree, c.dtype, False),
         _row_table(rule, rows, degree, c.dtype, None),
         _series_table(degree, c.dtype),
     )
@@ -169,7 +245,8 @@ def _analyse(values: Array, azimuth: Array, polar: Array, series: Array, degree:
     paired = jnp.stack([jnp.stack([even[0], odd[1]]), jnp.stack([even[1], odd[0]])])  # l + m even: even in z
     waves = jnp.einsum("pqjk,pqfjhr->pqhkfr", polar, paired)
     blocks = jnp.einsum("pqhik,pqhkfr->fpqhir", series, waves)
-    return blocks.reshape(blocks.shape[0], -1)[:, _block_index(degree)].reshape(*functions, -1)
+    blocks = blocks.reshape(blocks.shape[0], 8 * series.shape[2] ** 2)
+    return blocks[:, _block_index(degree)].reshape(*functions, (degree + 1) ** 2)
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5, 6))
@@ -197,13 +274,14 @@ def _synthesize(
 
 
 @functools.cache
-def _azimuth_table(columns: int, degree: int, dtype: DTypeLike) -> np.ndarray:
+def _azimuth_table(columns: int, degree: int, dtype: DTypeLike, cells: bool) -> np.ndarray:
     """cos and sin(m phi) at the columns [c, m, r], times sqrt(2) for m > 0; or the phases [m] of a Fourier transform.
 
+    Of `cells`, their means over the columns: sin(x) / x of the value in the middle, x = m times half a column.
     Few orders or few columns: a matrix product is faster than the transform.
     """
     m = np.arange(2 * (degree // 2 + 1))
-    norms = np.where(m == 0, 1, np.sqrt(2))
+    norms = np.where(m == 0, 1, np.sqrt(2)) * (np.sinc(m / columns) if cells else 1)
     if columns > max(256, 2 * degree) and degree > 32:
         return _round(norms * np.exp(-1j * np.pi * m / columns), np.result_type(dtype, np.complex64))
     m_phi = np.outer(_quadrature.azimuths(columns), m)
@@ -218,14 +296,29 @@ def _row_table(rule: Rows, rows: int, degree: int, dtype: DTypeLike, columns: in
     """
     theta, weights = _quadrature.gauss_rows(rows) if rule == "gauss" else _quadrature.fejer_rows(rows)
     half = (rows + 1) // 2
-    k = np.arange(2 * (degree // 2 + 1))
-    k_theta = np.outer(theta[:half], k)
-    table = np.stack([np.cos(k_theta), np.sin(k_theta)])  # q j k
+    theta, k = theta[:half], np.arange(2 * (degree // 2 + 1))
+    if columns is not None and rule != "gauss":
+        table = (_cell_moments if rule == "cells" else _interpolated_moments)(theta, rows, k)
+    else:
+        k_theta = np.outer(theta, k)
+        table = np.stack([np.cos(k_theta), np.sin(k_theta)])  # q j k
     if columns is not None:
-        table = table * weights[:half, None] if rule == "gauss" else _interpolated_moments(theta[:half], rows, k)
+        if rule == "gauss":
+            table *= weights[:half, None]
         table *= 2 * np.pi / columns
         table[:, rows // 2 :] /= 2  # a row on the equator is its own mirror image and counts twice
     return _round(np.stack([table[:, :, 0::2], table[:, :, 1::2]]), dtype)
+
+
+def _cell_moments(theta: np.ndarray, rows: int, k: np.ndarray) -> np.ndarray:
+    """Integrals of cos(k theta) sin(theta) and of sin(k theta) sin(theta) over each row, as [q, j, k].
+
+    The products are sums of sin and of cos(n theta), n = k + 1 and k - 1, each of whose integrals is its value in the
+    middle times 2 sin(n step / 2) / n: no recurrence in degree, so nothing grows, whatever the degree and the rows.
+    """
+    up, down = ((np.outer(theta, n), np.pi / rows * np.sinc(n / (2 * rows)) / 2) for n in (k + 1, k - 1))
+    even = np.sin(up[0]) * up[1] - np.sin(down[0]) * down[1]
+    return np.stack([even, np.cos(down[0]) * down[1] - np.cos(up[0]) * up[1]])
 
 
 def _interpolated_moments(theta: np.ndarray, rows: int, k: np.ndarray) -> np.ndarray:

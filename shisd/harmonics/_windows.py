@@ -8,6 +8,7 @@ notation: s = strength, w_l(s) = 1 / (1 + s l^2 (l+1)^2).
 """
 
 import functools
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize
+from shisd._sharding import by_device
 from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import _quadrature, _sh, _tables, _transform
 
@@ -29,7 +31,8 @@ _RUNGS = 48  # strengths that are tried before the bisection
 def hann_window(degree: int, width: ArrayLike | None = None) -> Float[Array, " bands"]:
     """Factors (1 + cos(pi l / width)) / 2 of the degrees l = 0 ... `degree`; zero from l = width on.
 
-    Arguments: static `degree` L; `width` > 0, L + 1 unless given. Returns [L+1] in the dtype of `width`.
+    Arguments: static `degree` L; `width` > 0, L + 1 unless given (0 or less raises). Returns [L+1] in
+    the dtype of `width`.
     Derivatives: in `width`.
     Source: Sloan 2008.
     """
@@ -49,6 +52,7 @@ def lanczos_window(degree: int, width: ArrayLike | None = None) -> Float[Array, 
 def _ratio(degree: int, width: ArrayLike | None) -> Float[Array, " bands"]:
     degree = _checks.degree(degree)
     width = _checks.scalar("width", degree + 1 if width is None else width)
+    width = _checks.require(width, width > 0, "`width` must be > 0.")
     return jnp.arange(degree + 1).astype(width.dtype) / jnp.broadcast_to(width, (degree + 1,))
 
 
@@ -61,6 +65,7 @@ def laplacian_window(degree: int, strength: ArrayLike) -> Float[Array, " bands"]
     Source: Sloan 2008.
     """
     degree, strength = _checks.degree(degree), _checks.scalar("strength", strength)
+    strength = _checks.require(strength, strength >= 0, "`strength` must be >= 0.")
     return 1 / (1 + strength * jnp.asarray(_curvature(degree), strength.dtype))
 
 
@@ -112,16 +117,18 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
     """
     c, degree = _checks.coefficients("coefficients", coefficients)
     floor = _checks.scalar("floor", floor).astype(c.dtype)
-    windowed, strength, hopeless = _dering_each(c.reshape(-1, c.shape[-1]), floor, degree)
+    windowed, strength, hopeless = by_device(_dering_each, {"coefficients": c}, floor, degree)
     status = WindowStatus.where(jnp.any(hopeless), WindowStatus.mean_below_floor, WindowStatus.ok)
     if throw:
         windowed, strength = status.error_if((windowed, strength), jnp.any(hopeless))
-    return Deringed(windowed.reshape(c.shape), strength.reshape(c.shape[:-1]), status)
+    return Deringed(windowed, strength, status)
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _dering_each(c: Float[Array, "f n"], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:
-    return jax.vmap(lambda c: _dering(c, floor, degree))(c)
+def _dering_each(batch: dict[str, Array], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:
+    c = batch["coefficients"]
+    each = jax.vmap(lambda c: _dering(c, floor, degree))(c.reshape(math.prod(c.shape[:-1]), c.shape[-1]))
+    return tuple(x.reshape(*c.shape[:-1], *x.shape[1:]) for x in each)
 
 
 def _dering(c: Float[Array, " n"], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:

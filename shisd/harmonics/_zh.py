@@ -36,7 +36,7 @@ def legendre_of_versine(t: Float[Array, "*batch"], degree: int) -> Float[Array, 
 
 def _series(t: Float[Array, "*batch"], mirrored: Array, degree: int) -> Float[Array, "*batch n"]:
     """P_l(1 - t), or P_l(t - 1) = (-1)^l P_l(1 - t) where `mirrored`."""
-    one = jnp.ones_like(t)
+    one = 1 + 0 * t  # NaN where t is
 
     def step(carry, l):
         p, difference = carry  # P_(l-1) and P_l - P_(l-1)

@@ -287,7 +287,8 @@ def _from_maps(points: Points, maps: MirrorMaps) -> Float[Array, " p *colour"]:
         square = jnp.sum(v * v, axis=2, keepdims=True)
         angle = safe_sqrt(square)
         sinc = jnp.where(square > 0, jnp.sin(angle) / jnp.where(square > 0, angle, 1), 1)
-        looked = sample_map(texels, jnp.cos(angle) * u[None] + sinc * v).reshape(len(z), -1, levels, colours)
+        around = jnp.cos(angle) * u[None] + sinc * v
+        looked = sample_map(texels, around, texels="samples").reshape(*around.shape[:2], levels, colours)
         share = jnp.clip(((det / safe)[None] - lower) / (upper - lower), 0, 1)  # of the upper of two levels
         ends = jnp.pad(share, ((1, 1), (0, 0)), constant_values=((1, 0), (0, 0)))
         values = jnp.einsum("z,zplc,lp->pc", weights, looked, ends[:-1] - ends[1:])

@@ -90,7 +90,8 @@ def sampled(name: str, room: str, samples: int, filtered: bool = True) -> tuple[
     def picture(normals, positions, eye):
         views = normalize(eye[None] - positions)
         directions = 2 * jnp.sum(views * normals, axis=1, keepdims=True) * normals - views
-        light = jnp.zeros((*of.seen.shape, 3)).at[row, column].set(harmonics.sample_map(texels, directions))
+        looked = harmonics.sample_map(texels, directions, texels="samples")
+        light = jnp.zeros((*of.seen.shape, 3)).at[row, column].set(looked)
         if not filtered:
             return light
         return jnp.einsum("is,stc,jt->ijc", matrix, light, matrix, optimize=True) / coverage

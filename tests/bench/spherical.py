@@ -466,7 +466,7 @@ def projection(degree: int, quick: bool) -> Task:
 
 @functools.cache
 def _projection(degree: int):
-    return lambda texels: harmonics.project_map(texels, degree)
+    return lambda image: harmonics.project_map(image, degree, texels="samples")
 
 
 @functools.cache

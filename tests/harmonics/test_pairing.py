@@ -24,7 +24,10 @@ def in_order(s, degree):
     return tuple(jnp.swapaxes(s[:, index], 0, 1) for index in (plus, minus))
 
 
-@pytest.mark.parametrize(("degree", "colours"), [(0, (1, 3)), (1, (3, 1)), (7, (3, 3)), (11, (1, 3))])
+slow = lambda *values: pytest.param(*values, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("degree", "colours"), [(1, (3, 1)), (11, (1, 3)), slow(0, (1, 3)), slow(7, (3, 3))])
 def test_products_with_turned_expansions(degree, colours, dtype, rng):
     r = rotations(rng, 10)
     s = rng.normal(size=(colours[0], (degree + 1) ** 2, len(r)))
