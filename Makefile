@@ -7,12 +7,13 @@ RUN := $(VENV)/bin/python
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint report applications bench clean
+.PHONY: help demo test test-slow mutants lint report applications bench clean
 
 help:
 	@echo "make demo       relight two objects with real maps; pictures and a table go to output/relight"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests: examples, notebooks, convergence"
+	@echo "make mutants    small faults put into a copy of the package; each has to be caught by the test named for it"
 	@echo "make lint       ruff and pyright"
 	@echo "make report     speed against error, beside other methods, to output/report; QUICK=1 for a few of them, README=1 also there"
 	@echo "make applications  the same for shadows, balls of light, mirrors, measurements, BRDF matrices"
@@ -27,6 +28,9 @@ test: $(VENV)/.test
 
 test-slow: $(VENV)/.test
 	$(RUN) -m pytest -n 2 --dist loadfile -m slow
+
+mutants: $(VENV)/.test
+	$(RUN) -m pytest -n 2 tests/test_mutants.py
 
 lint: $(VENV)/.test
 	$(RUN) -m ruff check .

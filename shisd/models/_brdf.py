@@ -8,7 +8,7 @@ G1(o) / cos_o = 2 / (cos_o + sqrt(cos_o^2 + alpha^2 sin_o^2)), so that nothing i
 
 import abc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, TypeVar, final
 
 import equinox as eqx
@@ -23,6 +23,7 @@ from shisd._typing import Array, Float, Scalar, Vector
 Colour = Float[Array, "..."]  # () or (3,); the parameters of one model may mix both
 Parameter = ArrayLike | Sequence[float]
 Pytree = TypeVar("Pytree")
+SMOOTHEST = 1e-6  # roughness below it is taken as it: with the half vector's rounding nothing narrower is resolved
 
 
 class AbstractBrdf(eqx.Module):
@@ -31,12 +32,16 @@ class AbstractBrdf(eqx.Module):
     A BRDF takes one pair of unit vectors [3]; use `jax.vmap` for more. Its result has the shape `colour`: () when every
     parameter is a scalar, (3,) when one of them has shape [3]. The dtype of the result is that of the directions.
 
+    Bad values: a direction or parameter that is not finite, or a parameter below the least value that its model states
+    (a negative roughness or exponent, say), gives NaN, also below the horizon, and NaN derivatives.
+
     Derivatives: in both directions and every parameter; finite everywhere, and zero below the horizon. Directions are
     taken as unit vectors, not normalised, so only derivatives along the sphere mean something. `value` jumps at the
     horizon, wi.z = 0 or wo.z = 0; `value_cosine` is continuous at wi.z = 0 where `value` is bounded.
     """
 
     isotropic: eqx.AbstractVar[bool]  # static: whether turning wi and wo together about the normal changes nothing
+    least: ClassVar[Mapping[str, float]] = {}  # of the parameters that have a least value
 
     @abc.abstractmethod
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
@@ -79,11 +84,14 @@ def colour(name: str) -> Callable[[Parameter], Array]:
     return parameter(name, ((), (3,)))
 
 
-def above_horizon(wi: ArrayLike, wo: ArrayLike) -> tuple[Vector, Vector, Array]:
-    """Checked directions of one dtype, and whether both are above the horizon.
+def above_horizon(
+    wi: ArrayLike, wo: ArrayLike, model: AbstractBrdf | None = None
+) -> tuple[Vector, Vector, Array, Array]:
+    """Checked directions of one dtype, whether both are above the horizon, and the value where they are not.
 
     Where they are not, both are replaced by the normal: the formula that follows stays finite, and so does its
-    derivative, and the caller selects zero.
+    derivative, and the caller selects the value elsewhere. That is 0, or NaN with NaN derivatives in everything if a
+    direction or a parameter of `model` is bad.
     """
     wi, wo = _checks.real_array("wi", wi), _checks.real_array("wo", wo)
     for name, direction in (("wi", wi), ("wo", wo)):
@@ -92,9 +100,14 @@ def above_horizon(wi: ArrayLike, wo: ArrayLike) -> tuple[Vector, Vector, Array]:
             raise ValueError(f"`{name}` must have shape [3]; got {shape}. Use jax.vmap for batches.")
     dtype = max(wi.dtype, wo.dtype, key=lambda d: d.itemsize)
     wi, wo = wi.astype(dtype), wo.astype(dtype)
-    above = (wi[2] > 0) & (wo[2] > 0)
+    inputs = [wi, wo, *jax.tree.leaves(model)]
+    bounded = [(getattr(model, name), least) for name, least in getattr(model, "least", {}).items()]
+    good = [jnp.all(jnp.isfinite(a)) for a in inputs] + [jnp.all(a >= b) for a, b in bounded if a is not None]
+    nothing = jnp.where(jnp.all(jnp.stack(good)), jnp.zeros((), dtype), jnp.nan)
+    elsewhere = jnp.sum(jnp.stack([jnp.sum(nothing * a.astype(dtype)) for a in inputs]))
+    above = (wi[2] > 0) & (wo[2] > 0) & ~jnp.isnan(nothing)
     normal = jnp.array([0, 0, 1], dtype)
-    return jnp.where(above, wi, normal), jnp.where(above, wo, normal), above
+    return jnp.where(above, wi, normal), jnp.where(above, wo, normal), above, elsewhere
 
 
 def cast(model: Pytree, dtype: DTypeLike) -> Pytree:
@@ -160,8 +173,8 @@ class Lambertian(AbstractBrdf):
     isotropic: ClassVar[bool] = True
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
-        wi, wo, above = above_horizon(wi, wo)
-        return jnp.where(above, cast(self, wi.dtype).albedo / math.pi, 0)
+        wi, wo, above, elsewhere = above_horizon(wi, wo, self)
+        return jnp.where(above, cast(self, wi.dtype).albedo / math.pi, elsewhere)
 
     @property
     def lobe_width(self) -> Scalar:
@@ -185,16 +198,17 @@ class Phong(AbstractBrdf):
     exponent: Scalar = eqx.field(converter=scalar("exponent"))
     diffuse: Colour = eqx.field(converter=colour("diffuse"), default=0.0)  # type: ignore[assignment]
     isotropic: ClassVar[bool] = True
+    least: ClassVar = {"exponent": 0.0}
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
-        wi, wo, above = above_horizon(wi, wo)
+        wi, wo, above, elsewhere = above_horizon(wi, wo, self)
         p = cast(self, wi.dtype)
         chord = wi - wo * jnp.array([-1, -1, 1], wo.dtype)  # from the mirror direction to wi: r.wi = 1 - |chord|^2 / 2
         versine = jnp.sum(chord * chord) / 2
         inside = versine < 1
         power = jnp.where(inside, jnp.exp(p.exponent * jnp.log1p(-jnp.where(inside, versine, 0))), 0)
         lobe = p.specular * ((p.exponent + 2) / (2 * math.pi) * power)
-        return jnp.where(above, p.diffuse / math.pi + lobe, 0)
+        return jnp.where(above, p.diffuse / math.pi + lobe, elsewhere)
 
     @property
     def lobe_width(self) -> Scalar:
@@ -207,9 +221,10 @@ class Ggx(AbstractBrdf):
     f = D(h) F(cos theta_d) G1(wi) G1(wo) / (4 cos_i cos_o).
 
     Energy: below 1 for F <= 1; what scatters between facets is lost (at alpha = 1 more than half, at grazing views).
-    Reciprocal. Arguments: `alpha` > 0, the slope roughness (not its root): a scalar, or [2] for (alpha_x, alpha_y)
+    Reciprocal. Arguments: `alpha` >= 0, the slope roughness (not its root): a scalar, or [2] for (alpha_x, alpha_y)
     along the local x and y axes. Fresnel: by Schlick from `f0`, scalar or [3], by default 1; or of a conductor when
-    `eta` and `k` are given, scalar or [3], relative to the outside medium (k = 0 is a dielectric).
+    `eta` >= 0 and `k` >= 0 are given, scalar or [3], relative to the outside medium (k = 0 is a dielectric).
+    Below 1e-6 `alpha` is taken as 1e-6, with gradient 0: at alpha = 0, a mirror, 2e-5 is left from 1 degree beside it.
     Derivatives: everywhere above the horizon; with k = 0 and eta < 1, total reflection has a kink.
     Accuracy: float32 follows float64 to 3e-6 of the value at the same directions (tests, alpha 0.02 to 1); rounding
     the directions themselves to float32 moves a narrow lobe by about 1e-7 / alpha of its width.
@@ -221,6 +236,7 @@ class Ggx(AbstractBrdf):
     eta: Colour | None
     k: Colour | None
     isotropic: bool = eqx.field(static=True)
+    least: ClassVar = {"alpha": 0.0, "eta": 0.0, "k": 0.0}
 
     def __init__(
         self,
@@ -241,20 +257,21 @@ class Ggx(AbstractBrdf):
         self.k = None if k is None else colour("k")(k)
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
-        wi, wo, above = above_horizon(wi, wo)
+        wi, wo, above, elsewhere = above_horizon(wi, wo, self)
         p = cast(self, wi.dtype)
-        alphas = (p.alpha, p.alpha) if p.isotropic else (p.alpha[0], p.alpha[1])
+        alpha = jnp.maximum(p.alpha, SMOOTHEST)
+        alphas = (alpha, alpha) if p.isotropic else (alpha[0], alpha[1])
         half, cos_d = half_vector(wi, wo)
         facets = ggx_distribution(half, *alphas) * smith_over_cosine(wi, *alphas) * smith_over_cosine(wo, *alphas) / 4
         if p.f0 is not None:
             fresnel = schlick_fresnel(cos_d, p.f0)
         else:
             fresnel = conductor_fresnel(cos_d, p.eta, p.k)  # type: ignore[arg-type]  # given together
-        return jnp.where(above, facets * fresnel, 0)
+        return jnp.where(above, facets * fresnel, elsewhere)
 
     @property
     def lobe_width(self) -> Scalar:
-        return jax.lax.stop_gradient(jnp.minimum(jnp.min(self.alpha), 1))
+        return jax.lax.stop_gradient(jnp.clip(jnp.min(self.alpha), SMOOTHEST, 1))
 
 
 class CookTorrance(AbstractBrdf):
@@ -266,8 +283,9 @@ class CookTorrance(AbstractBrdf):
     lights.
 
     Energy: that of the published model, which may pass 1 by a little for rough dielectrics. Reciprocal.
-    Arguments: `roughness` r in (0, 1] and `metallic` m in [0, 1], scalars; `albedo` c and `ior`, scalar or [3]; static
-    `direct`. A roughness of exactly 0 is a mirror, not a function: the result is then NaN at the mirror direction.
+    Arguments: `roughness` r in [0, 1] and `metallic` m in [0, 1], scalars; `albedo` c and `ior` >= 0, scalar or [3];
+    static `direct`. Below 1e-6 alpha is taken as 1e-6, with gradient 0: at r = 0 the lobe is a mirror, and away from it
+    the diffuse part is left.
     Derivatives: everywhere above the horizon. Accuracy: float32 follows float64 to 3e-6 of the value at the same
     directions (tests, roughness 0.02 to 1).
     """
@@ -278,21 +296,22 @@ class CookTorrance(AbstractBrdf):
     ior: Colour = eqx.field(converter=colour("ior"), default=1.5)  # type: ignore[assignment]
     direct: bool = eqx.field(static=True, default=False, kw_only=True)
     isotropic: ClassVar[bool] = True
+    least: ClassVar = {"roughness": 0.0, "ior": 0.0}
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
-        wi, wo, above = above_horizon(wi, wo)
+        wi, wo, above, elsewhere = above_horizon(wi, wo, self)
         p = cast(self, wi.dtype)
         # notation of OCCT: r, m, c as in the docstring; l = wi, v = wo.
         r, m, c = p.roughness, p.metallic, p.albedo
-        alpha = r * r
+        alpha = jnp.maximum(r * r, SMOOTHEST)
         k = (r + 1) ** 2 / 8 if p.direct else alpha / 2
         f0 = ((1 - p.ior) / (1 + p.ior)) ** 2 * (1 - m) + c * m
         half, cos_vh = half_vector(wi, wo)
         d = ggx_distribution(half, alpha, alpha)
         g = 1 / ((wi[2] * (1 - k) + k) * (wo[2] * (1 - k) + k))  # G / (cos_l cos_v)
         f = schlick_fresnel(cos_vh, f0)
-        return jnp.where(above, d * g / 4 * f + (1 - f) * (1 - m) * c / math.pi, 0)
+        return jnp.where(above, d * g / 4 * f + (1 - f) * (1 - m) * c / math.pi, elsewhere)
 
     @property
     def lobe_width(self) -> Scalar:
-        return jax.lax.stop_gradient(jnp.minimum(self.roughness**2, 1))
+        return jax.lax.stop_gradient(jnp.clip(self.roughness**2, SMOOTHEST, 1))

@@ -31,7 +31,8 @@ class MeasuredBrdf(AbstractBrdf):
     the first ones, theta_h < 0.003 or theta_d < 0.5 degrees, it goes with the square of the angle to its mean over
     phi_d, which has no meaning at the pole itself; so wi = wo, and a half vector at the normal, are ordinary points.
 
-    Arguments: `table` [90, 90, 180, 3], with no negative value; `from_merl` reads a file. Colour is always (3,).
+    Arguments: `table` [90, 90, 180, 3]; `from_merl` reads a file. Negative values are interpolated as they are, and one
+    that is not finite gives NaN in the cells around it. Colour is always (3,).
     Derivatives: in the table and both directions, finite everywhere; those in the directions jump between bins.
     Accuracy: that of linear interpolation; a file of GGX at alpha = 0.3 comes back within 1 % where wi.z, wo.z > 0.3
     and 3 % where wi.z, wo.z > 0.05 (tests). Energy: as measured.
@@ -78,7 +79,7 @@ class MeasuredBrdf(AbstractBrdf):
         return cls(table)
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Float[Array, "3"]:
-        wi, wo, above = above_horizon(wi, wo)
+        wi, wo, above, elsewhere = above_horizon(wi, wo)
         theta_h, theta_d, phi_d = half_difference_angles(wi, wo)
         dtype = wi.dtype
 
@@ -113,7 +114,7 @@ class MeasuredBrdf(AbstractBrdf):
             + inside_h * (1 - inside_d) * at_d
             + (1 - inside_h) * (1 - inside_d) * at_both
         )
-        return jnp.where(above, value, 0)
+        return jnp.where(above, value, elsewhere)
 
     @property
     def lobe_width(self) -> Scalar:

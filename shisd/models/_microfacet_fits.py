@@ -11,10 +11,13 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from shisd._typing import Array, Scalar, Vector
 from shisd.models._brdf import AbstractBrdf, Colour, above_horizon, cast, colour, half_vector
+
+TINY = float(np.finfo(np.float32).tiny)  # the least positive number, where a parameter has to be positive
 
 
 def dielectric_fresnel(cosine: Scalar, ior: Colour) -> Colour:
@@ -33,8 +36,8 @@ class AbcMicrofacet(AbstractBrdf):
     f = diffuse / pi + a (1 + b (1 - cos theta_h))^-c F(cos theta_d) G / (pi cos_i cos_o), F the unpolarised Fresnel
     reflectance for the real index `ior`, G = min(1, 2 cos_h cos_i / cos_d, 2 cos_h cos_o / cos_d).
 
-    Arguments: `diffuse` and `a`, scalar or [3]; `b` >= 0, `c` and `ior` > 1, scalar or [3]. Energy: as fitted; the
-    model has no bound of its own. Reciprocal.
+    Arguments: `diffuse`, `a`, `b` >= 0, `c` >= 0 and `ior` >= 0, each scalar or [3]. Energy: as fitted; the model has
+    no bound of its own. Reciprocal.
     Derivatives: everywhere above the horizon; G has kinks where its branches meet. `value` grows like 1 / cos only when
     both directions are grazing and opposite.
     Accuracy: float32 follows float64 to 3e-6 of the value for the published nickel (tests).
@@ -47,9 +50,10 @@ class AbcMicrofacet(AbstractBrdf):
     c: Colour = eqx.field(converter=colour("c"))
     ior: Colour = eqx.field(converter=colour("ior"))
     isotropic: ClassVar[bool] = True
+    least: ClassVar = {"b": 0.0, "c": 0.0, "ior": 0.0}
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
-        wi, wo, above = above_horizon(wi, wo)
+        wi, wo, above, elsewhere = above_horizon(wi, wo, self)
         p = cast(self, wi.dtype)
         half, cos_d = half_vector(wi, wo)
         versine = (half[0] ** 2 + half[1] ** 2) / (1 + half[2])  # 1 - cos theta_h
@@ -59,7 +63,7 @@ class AbcMicrofacet(AbstractBrdf):
         valley = cos_d**2 * jnp.maximum(cos_i, cos_o) / (cos_i + cos_o)
         shadowing = 1 / jnp.maximum(jnp.maximum(cos_i * cos_o, valley), jnp.finfo(cos_i.dtype).tiny)
         specular = distribution * dielectric_fresnel(cos_d, p.ior) * (shadowing / math.pi)
-        return jnp.where(above, p.diffuse / math.pi + specular, 0)
+        return jnp.where(above, p.diffuse / math.pi + specular, elsewhere)
 
     @property
     def lobe_width(self) -> Scalar:
@@ -78,7 +82,7 @@ class SgdMicrofacet(AbstractBrdf):
     published formula is not for three of the fabrics (by up to 0.07).
 
     Arguments: all scalar or [3], in the order of the published table; `shift` is its theta0, in radians, `masking` its
-    lambda, `normalization` its kappa (K). alpha > 0, c > 0, k > 1.
+    lambda, `normalization` its kappa (K). alpha > 0, c > 0, k >= 0.
     Energy: as fitted. Reciprocal. Where G1 has not reached zero at 90 degrees, `value` grows like 1 / cos towards
     grazing angles, as published; `value_cosine` then stays bounded as wi.z -> 0 but not as wo.z -> 0.
     Derivatives: everywhere above the horizon; F and G1 have kinks where they meet 0, and G1 a conical point at the
@@ -100,9 +104,10 @@ class SgdMicrofacet(AbstractBrdf):
     k: Colour = eqx.field(converter=colour("k"))
     shift: Colour = eqx.field(converter=colour("shift"))
     isotropic: ClassVar[bool] = True
+    least: ClassVar = {"alpha": TINY, "c": TINY, "k": 0.0}
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
-        wi, wo, above = above_horizon(wi, wo)
+        wi, wo, above, elsewhere = above_horizon(wi, wo, self)
         s = cast(self, wi.dtype)
         half, cos_d = half_vector(wi, wo)
         cos2_h = jnp.maximum(half[2] ** 2, 1e-12)  # exp(-x) is zero long before
@@ -110,7 +115,7 @@ class SgdMicrofacet(AbstractBrdf):
         d = s.normalization / math.pi * jnp.exp(-x - s.p * jnp.log(x) - 2 * jnp.log(cos2_h))
         f = jnp.maximum(s.f0 - s.f1 * cos_d + (1 - s.f0) * (1 - cos_d) ** 5, 0)
         g = s._masking(wi) / wi[2] * (s._masking(wo) / wo[2])
-        return jnp.where(above, s.diffuse / math.pi + s.specular * f * d * g / math.pi, 0)
+        return jnp.where(above, s.diffuse / math.pi + s.specular * f * d * g / math.pi, elsewhere)
 
     def _masking(self, direction: Vector) -> Array:
         """G1(theta), with c (theta - theta0)^k from its logarithm, kept below 60: exp(60) = 1e26, and G1 long zero."""

@@ -55,9 +55,9 @@ class ProjectedBrdf(AbstractBrdf):
         return size - 1 if self.isotropic else _checks.degree_of(size)
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
-        wi, wo, above = above_horizon(wi, wo)
+        wi, wo, above, elsewhere = above_horizon(wi, wo, self)
         value = self.slice_coefficients(wo) @ sh_basis(wi, self.degree)
-        return jnp.where(above, jnp.maximum(value, 0) if self.clamp else value, 0)
+        return jnp.where(above, jnp.maximum(value, 0) if self.clamp else value, elsewhere)
 
     def slice_coefficients(self, wo: Vector) -> Float[Array, "*colour n"]:
         """SH coefficients of wi -> f(wi, wo), without the cosine and with no horizon."""

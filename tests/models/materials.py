@@ -94,9 +94,18 @@ def evaluate(brdf, wi, wo):
 
 @eqx.filter_jit
 def slopes(brdf, wi, wo):
-    """The sum over colours of `brdf.value_cosine` at rows of directions, and its derivatives in both."""
-    f = lambda wi, wo: jnp.sum(brdf.value_cosine(wi, wo))
-    return jax.vmap(jax.value_and_grad(f, argnums=(0, 1)))(wi, wo)
+    """`brdf.value` at rows of directions, the sum over colours of `brdf.value_cosine`, and its derivatives: in the list
+    of parameters, in wi and in wo.
+    """
+    leaves, tree = jax.tree.flatten(brdf)
+
+    def f(leaves, wi, wo):
+        model = jax.tree.unflatten(tree, leaves)
+        return jnp.sum(model.value_cosine(wi, wo)), model.value(wi, wo)
+
+    both = jax.vmap(jax.value_and_grad(f, argnums=(0, 1, 2), has_aux=True), in_axes=(None, 0, 0))
+    (cosined, value), derivatives = both(leaves, wi, wo)
+    return value, cosined, derivatives
 
 
 def array(values, dtype):
