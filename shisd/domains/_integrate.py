@@ -8,6 +8,7 @@ large polygons, but takes longer, and small polygons lose digits in it.
 """
 
 import functools
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -17,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 
 from shisd import _checks
-from shisd._numerics import normalize, same_dtype
+from shisd._numerics import dot, normalize, same_dtype
 from shisd._typing import Array, Float
 from shisd.decomposition import fibonacci_directions, optimized_directions
 from shisd.decomposition._directions import TABLE_DEGREE
@@ -87,9 +88,8 @@ def integrate(coefficients: ArrayLike, region: Region) -> Float[Array, "*batch"]
     """
     c, degree = _checks.coefficients("coefficients", coefficients)
     _check_region(region)
-    basis = _coefficients(region, degree)
-    dtype = jnp.promote_types(c.dtype, basis.dtype)
-    return jnp.einsum("...n,n->...", c.astype(dtype), basis.astype(dtype), precision="highest")
+    c, basis = same_dtype(c, _coefficients(region, degree))
+    return jnp.einsum("...n,n->...", c, basis, precision="highest")
 
 
 def _axes(axes: ArrayLike) -> Float[Array, "k 3"]:
@@ -115,7 +115,9 @@ def _checked_axes(axes: Array) -> Array:
 def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "k l"]:
     d = _checked_axes(axes)
     if isinstance(region, SphericalCap):
-        return cap_integrals(region.versine, degree)[None] * legendre(d @ region.axis.astype(d.dtype), degree)
+        axis, d = same_dtype(region.axis, d)
+        cosine = dot(d.T, axis[:, None])
+        return cap_integrals(region.versine.astype(d.dtype), degree)[None] * legendre(cosine, degree)
     v, d = same_dtype(region.loop(), d)
     angle = jnp.broadcast_to(loop_solid_angle(v, region.largest)[None, None], (1, d.shape[0], 1))
     rest = [_moments.moments(d, v, degree)] if degree else []
@@ -138,7 +140,7 @@ def _coefficients(region: Region, degree: int) -> Float[Array, " n"]:
 
 def loop_coefficients(v: Loop, solid_angle: Float[Array, " p"], degree: int) -> Float[Array, "n p"]:
     """Integrals of the basis over loops, [(L+1)^2, p]."""
-    constant = (solid_angle * np.sqrt(1 / (4 * np.pi)))[None]
+    constant = (solid_angle * math.sqrt(1 / (4 * np.pi)))[None]
     if degree == 0:
         return constant
     axes, inverse = zonal_inverse(degree, v.dtype)
