@@ -20,14 +20,16 @@ class SphericalPolygon(eqx.Module):
     """A region of the sphere bounded by great arcs between unit vertices.
 
     Arguments: `vertices` [slots, 3], unit vectors, each arc shorter than pi; `count`, how many of them are used (all,
-    unless given; it may be traced): the slots after them are padding, whatever they hold, NaN excepted.
+    unless given; it may be traced): the slots after them are padding, whatever they hold.
     Orientation: positive when counter-clockwise seen from outside the sphere, the interior on the left of every edge.
     Reversed winding changes the sign of every integral. Outlines need not be convex. Where an outline crosses itself,
     each part counts as often as the outline winds around it.
     A curve alone does not tell a polygon from the reversed outline of what is outside it: their integrals differ by
     those over the whole sphere. Solid angles are taken in (`largest` - 4 pi, `largest`], static, by default (-2 pi, 2
     pi]: every polygon that fits in a hemisphere, with the sign of its winding. For polygons that are larger than a
-    hemisphere pass largest = 4 pi: what is on the left of the edges.
+    hemisphere pass largest = 4 pi: what is on the left of the edges. The ends of that range are one outline: one that is
+    a great circle to rounding is 2 pi, both ways round, as either has a hemisphere on its left; one that surrounds
+    nothing is 0, also with largest = 4 pi.
     Bad input: fewer than three vertices or a wrong shape is a ValueError; vertices that are NaN or off the sphere by
     more than 1e-3, and arcs of length pi, which no plane determines, are errors in the functions of `domains`. Points
     in space become polygons with `polygon_from_points`.
@@ -142,7 +144,11 @@ def _solid_angle(polygon: SphericalPolygon) -> Scalar:
 
 
 def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | None = None) -> Float[Array, " p"]:
-    """Solid angles of loops. The fan starts at the first vertex, or where another is nearly opposite, at `fallback`."""
+    """Solid angles of loops, in (largest - 4 pi, largest] up to rounding.
+
+    The fan starts at the first vertex, or where another is nearly opposite, at `fallback`: where it is given, it is a
+    direction that no vertex is more than a quarter turn away from, and the fan adds up to what is meant.
+    """
     first = jax.lax.stop_gradient(v[:, 0])
     risky = jnp.min(dot(v, first[:, None]), axis=0) < -0.9
     other = _far_from_opposites(jax.lax.stop_gradient(v)) if fallback is None else jax.lax.stop_gradient(fallback)
@@ -152,9 +158,11 @@ def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | No
     across = dot(apex - v, cross(v, jnp.where(short[None], chord, middle)))
     along = dot(middle, apex + 0.5 * middle)
     angle = 2 * jnp.sum(arctan2(across, along), axis=0)
+    if fallback is not None:
+        return angle
     # Both ends of the range are one outline, and rounding decides between them: a hemisphere is 2 pi, nothing is 0.
     size = jnp.sum(jnp.sqrt(dot(apex - v, apex - v) * dot(chord, chord)), axis=0)
-    rounding = 8 * jnp.finfo(v.dtype).eps * size
+    rounding = 16 * jnp.finfo(v.dtype).eps * size
     from_lowest = angle - (largest - 4 * np.pi) + (rounding if largest > 2 * np.pi else -rounding)
     turns = jnp.floor(jax.lax.stop_gradient(from_lowest) / (4 * np.pi))
     return angle - (4 * np.pi) * turns
