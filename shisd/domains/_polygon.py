@@ -27,8 +27,8 @@ class SphericalPolygon(eqx.Module):
     A curve alone does not tell a polygon from the reversed outline of what is outside it: their integrals differ by
     those over the whole sphere. Solid angles are taken in (`largest` - 4 pi, `largest`], static, by default (-2 pi, 2
     pi]: every polygon that fits in a hemisphere, with the sign of its winding. For polygons that are larger than a
-    hemisphere pass largest = 4 pi: what is on the left of the edges. The ends of that range are one outline: one that is
-    a great circle to rounding is 2 pi, both ways round, as either has a hemisphere on its left; one that surrounds
+    hemisphere pass largest = 4 pi: what is on the left of the edges. Rounding never chooses between the ends of that
+    range: a great circle is 2 pi, both ways round, as each has a hemisphere on its left; an outline that surrounds
     nothing is 0, also with largest = 4 pi.
     Bad input: fewer than three vertices or a wrong shape is a ValueError; vertices that are NaN or off the sphere by
     more than 1e-3, and arcs of length pi, which no plane determines, are errors in the functions of `domains`. Points
