@@ -1,6 +1,7 @@
 """Small numerical helpers that every stage shares."""
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +63,8 @@ def cross(a: Vector, b: Vector) -> Array:
 
 def same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
     """Both in the dtype that they promote to, also where JAX promotes nothing by itself."""
-    dtype = jnp.promote_types(a.dtype, b.dtype)
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.promote_types(a.dtype, b.dtype)
     return a.astype(dtype), b.astype(dtype)
 
 
@@ -91,7 +93,7 @@ def arctan2(y: Array, x: Array) -> Array:
     """
     a, b = jnp.abs(y), jnp.abs(x)
     large, small = jnp.maximum(a, b), jnp.minimum(a, b)
-    wide = small > np.tan(np.pi / 8) * large  # then the angle to the diagonal
+    wide = small > math.tan(np.pi / 8) * large  # then the angle to the diagonal
     over = jnp.where(wide, small + large, jnp.where(large > 0, large, 1))
     t = jnp.where(wide, small - large, small) / over
     series = jnp.zeros_like(t)

@@ -109,6 +109,20 @@ AXES_AT_POLYGONS = {
 }
 
 
+def _near_half_turn(gap):
+    return unit([[1, 0, 0], [-np.cos(gap), np.sin(gap), 0], [0, 0.3, 1]]) @ _TURN
+
+
+def _corner(legs):
+    return unit([[0, 0, 1], [legs, 0, 1], [0, legs, 1]]) @ _TURN
+
+
+_TURN = ring([0, np.pi / 2], np.pi / 2, (1, 2, 3))
+_TURN = np.concatenate([_TURN, np.cross(_TURN[:1], _TURN[1:])])  # a rotation
+HALF_TURNS = {f"edge {gap:.0e} rad short of pi": _near_half_turn(gap) for gap in 10.0 ** -np.arange(1, 7)}
+TINY = {f"solid angle {legs**2 / 2:.0e}": _corner(legs) for legs in (2e-3, 2e-4, 2e-5, 2e-6)}
+
+
 # ---- shading by a polygon: points of the light, and position, normal and view of the surface
 
 

@@ -99,28 +99,72 @@ def harmonics(directions, degree):
     return values.T, np.swapaxes(slopes, 0, 1)
 
 
+def solid_angle(vertices):
+    """Of a polygon [S, 3] that fits in a hemisphere, signed by its winding: a fan of triangles, in extended precision.
+
+    Each by the angle of van Oosterom and Strackee, with differences to the first vertex in place of products of three.
+    """
+    v = _unit(vertices)
+    a, b, c = v[:1], v[1:-1], v[2:]
+    volume, along = np.sum(a * np.cross(b - a, c - a), axis=-1), 1 + np.sum(a * b + b * c + c * a, axis=-1)
+    return 2 * np.sum(np.arctan2(volume, along))
+
+
+def part_above(vertices, *normals):
+    """The part of a polygon [S, 3] where w . normal >= 0 for each of the normals: edges one after another."""
+    v = _unit(vertices)
+    for normal in normals:
+        height, kept = v @ np.asarray(normal, np.longdouble), []
+        for a, b, h, k in zip(v, np.roll(v, -1, axis=0), height, np.roll(height, -1), strict=True):
+            kept += [a] * bool(h >= 0) + [_unit(abs(k) * a + abs(h) * b)] * bool(h * k < 0)
+        v = np.array(kept).reshape(-1, 3)
+    return v
+
+
 def edge_coefficients(vertices, degree, nodes=16, halvings=2):
     """Integrals [n] of the harmonics over a polygon [S, 3] from lines along its edges, in extended precision.
 
-    y_lm is -1/(l(l+1)) times its Laplacian, so its integral is that of n . grad y_lm along the edges over l(l+1), taken
-    on chords p(t) = a + t (b - a) of parts of the edges, with n ds = (a x b) dt / |p|^2. For l = 0, a fan of triangles.
+    y_lm is -1/(l(l+1)) times its Laplacian, so its integral is that of n . grad y_lm along the edges over l(l+1).
     """
-    unit = lambda p: p / np.sqrt(np.sum(p * p, axis=-1, keepdims=True))
-    v = unit(np.asarray(vertices, np.longdouble))
-    a, b, c = v[:1], v[1:-1], v[2:]
-    volume, along = np.sum(a * np.cross(b - a, c - a), axis=-1), 1 + np.sum(a * b + b * c + c * a, axis=-1)
-    solid_angle = 2 * np.sum(np.arctan2(volume, along))
+    p, line = _edge_lines(vertices, nodes, halvings)
+    _, slopes = harmonics(p, degree)
+    l = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+    integrals = np.einsum("pni,pi->n", slopes, line) / np.maximum(l * (l + 1), 1)
+    integrals[0] = solid_angle(vertices) / np.sqrt(4 * np.arctan2(np.longdouble(1), 0) * 2)
+    return integrals
+
+
+def edge_moments(vertices, axes, degree, nodes=16, halvings=2):
+    """Integrals [K, L+1] of P_l(w . axis) over a polygon by the same lines: of P_l'(w . axis) n . axis over l(l+1)."""
+    p, line = _edge_lines(vertices, nodes, halvings)
+    d = _unit(axes)
+    u, along = p @ d.T, line @ d.T
+    legendre, slope = [np.ones_like(u), u], [np.zeros_like(u), np.ones_like(u)]
+    for l in range(2, degree + 1):
+        legendre.append(((2 * l - 1) * u * legendre[-1] - (l - 1) * legendre[-2]) / l)
+        slope.append(slope[-2] + (2 * l - 1) * legendre[-2])
+    rest = [np.sum(slope[l] * along, axis=0) / (l * (l + 1)) for l in range(1, degree + 1)]
+    return np.stack([np.full(len(d), solid_angle(vertices)), *rest], axis=-1)
+
+
+def _edge_lines(vertices, nodes, halvings):
+    """Points on the edges of a polygon, and n ds there with n the inward normal, both [N, 3].
+
+    On chords p(t) = a + t (b - a) of parts of the edges, with n ds = (a x b) dt / |p|^2.
+    """
+    v = _unit(vertices)
     for _ in range(halvings):
-        v = np.stack([v, unit(v + np.roll(v, -1, axis=0))], axis=1).reshape(-1, 3)
+        v = np.stack([v, _unit(v + np.roll(v, -1, axis=0))], axis=1).reshape(-1, 3)
     end = np.roll(v, -1, axis=0)
     x, w = np.polynomial.legendre.leggauss(nodes)
     p = v[:, None] + ((x + 1) / 2)[:, None] * (end - v)[:, None]
     line = np.cross(v, end - v)[:, None] * (w / 2)[:, None] / np.sum(p * p, axis=-1, keepdims=True)
-    _, slopes = harmonics(p.reshape(-1, 3), degree)
-    l = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
-    integrals = np.einsum("pni,pi->n", slopes, line.reshape(-1, 3)) / np.maximum(l * (l + 1), 1)
-    integrals[0] = solid_angle / np.sqrt(4 * np.arctan2(np.longdouble(1), 0) * 2)
-    return integrals
+    return _unit(p.reshape(-1, 3)), line.reshape(-1, 3)
+
+
+def _unit(vectors):
+    x = np.asarray(vectors, np.longdouble)
+    return x / np.sqrt(np.sum(x * x, axis=-1, keepdims=True))
 
 
 _CENTRAL = {-3: -1 / 60, -2: 3 / 20, -1: -3 / 4, 1: 3 / 4, 2: -3 / 20, 3: 1 / 60}

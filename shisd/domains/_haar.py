@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import dot
+from shisd._numerics import dot, normalize
 from shisd._typing import Array, Float
 from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, clip, loop_solid_angle, on_sphere
@@ -73,7 +73,10 @@ class HaarBasis(eqx.Module):
         return s * jnp.asarray(1 / np.sqrt(self.areas), s.dtype).reshape((1,) * (s.ndim - 1) + (-1,))
 
     def evaluate(self, coefficients: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
-        """Values of one expansion [size] at directions [..., 3], any of the cells' on a common edge."""
+        """Values of one expansion [size] at directions [..., 3] of any length but zero, which gives NaN.
+
+        On a common edge of cells it is the value of one of them.
+        """
         c, d = self._sized("coefficients", coefficients), _checks.vectors("directions", directions)
         if c.ndim != 1:
             raise ValueError(f"`coefficients` must be one expansion [{self.size}]; got {list(c.shape)}. Use jax.vmap.")
@@ -84,7 +87,9 @@ class HaarBasis(eqx.Module):
             inner = jnp.asarray(_cells(level + 1).reshape(-1, 4, 3, 3)[:, 0], w.dtype)[cell]
             out = jnp.einsum("psi,pi->ps", jnp.cross(inner, jnp.roll(inner, -1, 1)), w) < 0
             cell = 4 * cell + jnp.where(jnp.any(out, axis=1), 1 + jnp.argmax(out, axis=1).astype(jnp.int32), 0)
-        return self.values(c)[cell].reshape(d.shape[:-1])
+        values = self.values(c)[cell]
+        no_direction = jnp.isnan(normalize(w)).any(axis=1)
+        return (values * jnp.where(no_direction, np.nan, jnp.ones_like(values))).reshape(d.shape[:-1])
 
     def project(self, polygon: SphericalPolygon) -> Float[Array, " n"]:
         """Coefficients of the indicator of a polygon that fits in a hemisphere, signed by its winding; exact.

@@ -23,7 +23,7 @@ The derivative of an integral is an integral along the moving edges. It has a re
 vertices coincide.
 
 layout: polygons are v[x y z, vertex, p], points p last as vector lanes; axes d[k, x y z]. What belongs to edges is
-[e, p] or [x y z, e, p]; to one edge [p] or [x y z, p], or, for all axes at once, [1, p] or [x y z, 1, p].
+[e, p] or [x y z, e, p]; to one edge [p] or [x y z, p], or, for all axes at once, [e, 1, p] or [x y z, e, 1, p].
 notation: alpha = a - c = tau - kappa c with tau at right angles to c; t = tan(theta/2); q, dq = P_l(u) at a and the
 difference quotient (P_l(u1) - P_l(u0)) / theta; a letter with `_c` belongs to the reference.
 """
@@ -189,38 +189,42 @@ def _for_axes(body: Callable, value: Value, axes: Array, weights: Array) -> Valu
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def moments(axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, "l k p"]:
     """I_l(axes[k]) for l = 1 ... degree."""
-    d, total, c, edges = _all_axes(_arcs(v), axes)
+    return _sweep(axes, v, degree)
+
+
+def _sweep(axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, "l k p"]:
+    total, c, _, x = _all_edges(_arcs(v), axes)
     first = 0.5 * total
     if degree == 1:
         return first[None]
-    terms = _zonal_terms(edges, d, c)
 
-    def step(state: tuple[_Point, list[_State]], n: _Factors) -> tuple[tuple[_Point, list[_State]], Array]:
-        point, states = state
-        states = [t.advance(s, point, n) for t, s in zip(terms, states, strict=True)]
+    def step(state: tuple[_Point, _State], n: _Factors) -> tuple[tuple[_Point, _State], Array]:
+        point, edges = state
+        edges = x.advance(edges, point, n)
         point = c.advance(point, n)
-        change = total * point.r + sum(t.along * s.s for t, s in zip(terms, states, strict=True))
-        return (point, states), change * n.laplacian
+        return (point, edges), (total * point.r[0] + _sum_first(x.along * edges.s)) * n.laplacian
 
-    _, rest = jax.lax.scan(step, (c.start(), [t.start() for t in terms]), _factors(2, degree, v.dtype))
+    _, rest = jax.lax.scan(step, (c.start(), x.start()), _factors(2, degree, v.dtype))
     return jnp.concatenate([first[None], rest])
 
 
 def _moments_jvp(degree, primals, tangents):
     (axes, v), (d_axes, dv) = primals, tangents
-    values = moments(axes, v, degree)
-    speeds = []
-    packed = _spans(v)
-    spans = _unpack(_Spans, packed)
+    change = None
+    if isinstance(d_axes, SymbolicZero):
+        values = moments(axes, v, degree)
+    else:  # of differences, like the values: the lines that the vertices turn along would lose a factor of the size
+        values, change = jax.jvp(lambda a: _sweep(a, v, degree), (axes,), (d_axes,))
     if not isinstance(dv, SymbolicZero):
-        speeds.append([x[:, None] for x in _speeds(spans, dv)])
-    if not isinstance(d_axes, SymbolicZero):  # in the frame that turns with each axis, the vertices turn back
-        turn = jnp.cross(axes, d_axes).T[:, None, :, None]
-        ends = (spans.start, spans.end)
-        speeds.append([-dot(turn, cross(x, spans.normal)[:, :, None]) for x in ends])
-    if not speeds:
-        return values, jnp.zeros_like(values)
-    start, end = (functools.reduce(jnp.add, s) for s in zip(*speeds, strict=True))
+        moved = _moved(axes, v, dv, degree)
+        change = moved if change is None else change + moved
+    return values, jnp.zeros_like(values) if change is None else change
+
+
+def _moved(axes: Float[Array, "k 3"], v: Loop, dv: Loop, degree: int) -> Float[Array, "l k p"]:
+    """Changes of the moments with the vertices."""
+    packed = _spans(v)
+    start, end = (x[:, None] for x in _speeds(_unpack(_Spans, packed), dv))
     spans = _unpack(_Spans, packed[:, :, None])
     terms = _boundary(spans, axes.T[:, None, :, None])
 
@@ -229,8 +233,7 @@ def _moments_jvp(degree, primals, tangents):
         a, b = _at_vertices(spans, state.middle, state.chord)
         return state, _sum_first(start * a + end * b)
 
-    _, change = jax.lax.scan(step, terms.start(), _factors(1, degree, v.dtype))
-    return values, -change
+    return -jax.lax.scan(step, terms.start(), _factors(1, degree, v.dtype))[1]
 
 
 moments.defjvp(_moments_jvp, symbolic_zeros=True)
@@ -241,21 +244,19 @@ def powers(axes: Float[Array, "k 3"], v: Loop, solid_angle: Float[Array, " p"], 
 
     n F_n = (n-1) (1 - g^2) F_{n-2} - [u^(n-1) u'] along the edges, (n+1) A_n = (n-1) A_{n-2} + sum of g F_{n-1}.
     """
-    d, total, c, edges = _all_axes(_arcs(v), axes)
-    a = [jnp.broadcast_to(solid_angle[None], total.shape), 0.5 * total]
-    a += [jnp.zeros_like(total)] * (order - 1)
-    for edge, x in zip(edges, _zonal_terms(edges, d, c), strict=True):
-        slope0 = x.end_slope + edge.t * (x.u0 + x.u1)  # u'(a)
-        f = [jnp.ones_like(x.u0), x.mean_u]  # F_n / theta
-        p0, p1 = x.u0, x.u1
-        for n in range(2, order + 1):
-            ends = jnp.where(edge.over_angle == 0, -p0 * x.u0, (p1 * x.end_slope - p0 * slope0) * edge.over_angle)
-            f.append(((n - 1) * (1 - x.g2) * f[n - 2] - ends) / n)
-            a[n] += x.along * f[n - 1]
-            p0, p1 = p0 * x.u0, p1 * x.u1
-    for n in range(2, order + 1):
-        a[n] = ((n - 1) * a[n - 2] + a[n]) / (n + 1)
-    return jnp.stack(a[: order + 1])
+    total, _, edges, x = _all_edges(_arcs(v), axes)
+    slope = x.end_slope + edges.t * x.both  # u'(a)
+
+    def step(state: tuple[Array, ...], n: Array) -> tuple[tuple[Array, ...], Array]:
+        f0, f, a0, a, p0, p1 = state  # F_n / theta and A_n of n-2 and n-1, u^(n-1) at the ends
+        ends = jnp.where(edges.over_angle == 0, -p0 * x.u0, (p1 * x.end_slope - p0 * slope) * edges.over_angle)
+        following = ((n - 1) * a0 + _sum_first(x.along * f)) / (n + 1)
+        return (f, ((n - 1) * (1 - x.g2) * f0 - ends) / n, a, following, p0 * x.u0, p1 * x.u1), following
+
+    a0, a = jnp.broadcast_to(solid_angle[None], total.shape), 0.5 * total
+    start = (jnp.ones_like(x.u0), x.mean_u, a0, a, x.u0, x.u1)
+    _, rest = jax.lax.scan(step, start, jnp.arange(2, order + 1, dtype=v.dtype))
+    return jnp.concatenate([jnp.stack([a0, a])[: order + 1], rest])
 
 
 class _Factors(NamedTuple):
@@ -287,6 +288,7 @@ class _Edges(NamedTuple):
     tau: Array  # a = c + tau - kappa c
     tau_next: Array  # of b
     d_tau: Array  # their difference
+    middle: Array  # a + b
     normal: Array  # theta n
     kappa: Array
     kappa_next: Array
@@ -306,6 +308,7 @@ class _Spans(NamedTuple):
     start: Array
     end: Array
     chord: Array  # b - a
+    middle: Array  # a + b
     normal: Array  # theta n
     angle: Array  # theta
     over_angle: Array
@@ -314,7 +317,7 @@ class _Spans(NamedTuple):
     over_half_cosine: Array
 
 
-_VECTORS = {"tau", "tau_next", "d_tau", "normal", "start", "end", "chord"}
+_VECTORS = {"tau", "tau_next", "d_tau", "normal", "start", "end", "chord", "middle"}
 
 
 def _pack(edges: _Edges | _Spans) -> Float[Array, "rows e p"]:
@@ -347,47 +350,59 @@ def _arcs(v: Loop) -> _Arcs:
     near = cosine > 0.5
     tau2 = dot(tau, tau)
     kappa = jnp.where(near, tau2 / (1 + jnp.sqrt(jnp.where(near, 1 - tau2, 1))), 1 - cosine)
-    end, tau_next, kappa_next = jnp.roll(v, -1, 1), jnp.roll(tau, -1, 1), jnp.roll(kappa, -1, 0)
+    tau_next, kappa_next = jnp.roll(tau, -1, 1), jnp.roll(kappa, -1, 0)
     d_tau, d_kappa = tau_next - tau, kappa_next - kappa
-    chord = d_tau - d_kappa[None] * c
-    t2, tail, ratio, normal = _turns(v, end, chord)
-    none, t, ratio_1 = _none(t2), safe_sqrt(t2), t2 + tail * (1 + t2)
+    chord, middle = d_tau - d_kappa[None] * c, sides(v)[1]
+    t2, tail, part, normal = _turns(v, chord, middle)
+    none, t, ratio, ratio_1 = _none(t2), safe_sqrt(t2), (1 + t2) * part, t2 + tail * (1 + t2)
     around = cross(jnp.broadcast_to(c, v.shape), chord)  # these add up to 0
     parts = ratio_1[None] * around + ratio[None] * cross(tau - kappa[None] * c, chord)
     parts = jnp.where((t2 < 1)[None], parts, normal - around)  # the same, where the chord is not small
     edges = _Edges(
-        tau, tau_next, d_tau, normal, kappa, kappa_next, d_kappa,
-        over_angle=_over(2 * t * (1 + tail), none), over_sine=_over(2 * t / (1 + t2), none),
-        t=t, over_t=_over(t, none), ratio_1=ratio_1, mean=0.5 / (1 + tail), excess=0.5 * tail / (1 + tail),
+        tau, tau_next, d_tau, middle, normal, kappa, kappa_next, d_kappa,
+        over_angle=_over(2 * t * part, none), over_sine=_over(2 * t / (1 + t2), none),
+        t=t, over_t=_over(t, none), ratio_1=ratio_1, mean=0.5 / part, excess=0.5 * tail / part,
     )  # fmt: skip
     total = _sum_first(jnp.moveaxis(parts, 1, 0))
     return _Arcs(_pack(edges), *jax.lax.optimization_barrier((c[:, 0], total)))
 
 
 def _spans(v: Loop) -> Float[Array, "rows e p"]:
-    end = jnp.roll(v, -1, 1)
-    chord, middle = end - v, v + end
-    t2, tail, _, normal = _turns(v, end, chord)
-    none, angle, half_sine = _none(t2), 2 * safe_sqrt(t2) * (1 + tail), 0.5 * safe_sqrt(dot(chord, chord))
+    chord, middle = sides(v)
+    t2, _, part, normal = _turns(v, chord, middle)
+    none, angle, half_sine = _none(t2), 2 * safe_sqrt(t2) * part, 0.5 * safe_sqrt(dot(chord, chord))
     over_half_cosine = 2 / jnp.sqrt(dot(middle, middle))
     spans = _Spans(
-        v, end, chord, normal, angle, _over(angle, none), half_sine, _over(half_sine, none), over_half_cosine
-    )
+        v, jnp.roll(v, -1, 1), chord, middle, normal, angle,
+        _over(angle, none), half_sine, _over(half_sine, none), over_half_cosine,
+    )  # fmt: skip
     return _pack(spans)
 
 
-def _turns(start: Array, end: Array, chord: Array) -> tuple[Array, Array, Array, Array]:
-    """Of edges: t^2, arctan(t)/t - 1, theta / sin(theta), and theta n."""
-    middle = start + end
+def sides(v: Loop) -> tuple[Loop, Loop]:
+    """Of every edge b - a and a + b, at right angles to each other.
+
+    Lengths that are 1 only to rounding tilt the shorter of the two, the more the shorter it is.
+    """
+    end = jnp.roll(v, -1, 1)
+    chord, middle = end - v, v + end
+    chord2, middle2 = dot(chord, chord), dot(middle, middle)
+    tilt, short = dot(chord, middle) / jnp.maximum(chord2, middle2), chord2 < middle2
+    upright = chord - jnp.where(short, tilt, 0)[None] * middle
+    return upright, middle - jnp.where(short, 0, tilt)[None] * chord
+
+
+def _turns(start: Loop, chord: Loop, middle: Loop) -> tuple[Array, Array, Array, Loop]:
+    """Of edges: t^2, arctan(t)/t - 1, arctan(t)/t, and theta n."""
     t2 = dot(chord, chord) / dot(middle, middle)
-    tail = _arctan_tail(t2)
-    ratio = (1 + t2) * (1 + tail)
-    return t2, tail, ratio, ratio[None] * cross(start, jnp.where((t2 < 1)[None], chord, middle))
+    tail, part = _arctan_parts(t2)
+    normal = ((1 + t2) * part)[None] * cross(start, jnp.where((t2 < 1)[None], chord, middle))
+    return t2, tail, part, normal
 
 
 def _none(t2: Array) -> Array:
-    """So short that it has no direction: its recurrence is that of a point."""
-    return t2 < (64 * jnp.finfo(t2.dtype).eps) ** 2
+    """Of no length, or one whose square is none: its recurrence is that of a point."""
+    return t2 < 1e4 * jnp.finfo(t2.dtype).tiny
 
 
 def _over(x: Array, none: Array) -> Array:
@@ -438,11 +453,12 @@ def _reference(c: Array, d: Array) -> _Reference:
     return _Reference(sign * (1 - gap), sign, gap, offset)
 
 
-def _all_axes(arcs: _Arcs, axes: Float[Array, "k 3"]) -> tuple[Array, Array, _Reference, list[_Edges]]:
-    """Axes [x y z, k, 1], T [k, p], the reference and the edges."""
-    d = axes.T[:, :, None]
-    edges = [_unpack(_Edges, arcs.edges[:, e, None]) for e in range(arcs.edges.shape[1])]
-    return d, dot(arcs.total[:, None], d), _reference(arcs.c[:, None], d), edges
+def _all_edges(arcs: _Arcs, axes: Float[Array, "k 3"]) -> tuple[Array, _Reference, _Edges, "_Zonal"]:
+    """T [k, p], and by edge, axis and polygon the reference [1, k, p], the edges [e, 1, p] and both [e, k, p]."""
+    d = axes.T[:, None, :, None]
+    c, edges = _reference(arcs.c[:, None, None], d), _unpack(_Edges, arcs.edges[:, :, None])
+    ends = c.project(edges.tau, edges.kappa), c.project(edges.tau_next, edges.kappa_next)
+    return dot(arcs.total[:, None], d[:, 0]), c, edges, _zonal(edges, d, c, *ends)
 
 
 class _State(NamedTuple):
@@ -465,6 +481,7 @@ class _Zonal(NamedTuple):
     u1: Array
     y0: Array  # u0 - u_c
     y1: Array
+    both: Array  # u0 + u1
     slope: Array  # (u1 - u0) / theta
     end_slope: Array  # u' at b
     mean_u: Array  # E_1 / theta
@@ -499,15 +516,17 @@ def _zonal_terms(edges: list[_Edges], d: Array, c: _Reference) -> list[_Zonal]:
 
 def _zonal(edge: _Edges, d: Array, c: _Reference, y0: Array, y1: Array) -> _Zonal:
     u0, u1, rise = c.u + y0, c.u + y1, c.project(edge.d_tau, edge.d_kappa)
-    slope, both, along = rise * edge.over_angle, u0 + u1, dot(edge.normal, d)
-    end_slope = jnp.where(edge.t < 1, rise * edge.over_sine - u1 * edge.t, u1 * edge.over_t - both * edge.over_sine)
+    slope, both, along = rise * edge.over_angle, dot(edge.middle, d), dot(edge.normal, d)
+    short = edge.t < 1
+    end_slope = jnp.where(short, rise * edge.over_sine - u1 * edge.t, u1 * edge.over_t - both * edge.over_sine)
+    below_slope = jnp.where(short, u1 * edge.t - slope * edge.ratio_1, slope - end_slope)
     return _Zonal(
-        u0, u1, y0, y1, slope, end_slope,
+        u0, u1, y0, y1, both, slope, end_slope,
         mean_u=both * edge.mean,
         g2=jnp.where(edge.over_angle == 0, 1 - u1 * u1, (along * edge.over_angle) ** 2),
         along=along,
         of_value=both * edge.excess - 0.5 * (y0 + y1),
-        of_derivative=end_slope * (u1 * edge.t - slope * edge.ratio_1) - y1 * (u1 + c.u),
+        of_derivative=end_slope * below_slope - y1 * (u1 + c.u),
     )  # fmt: skip
 
 
@@ -561,12 +580,19 @@ class _Boundary(NamedTuple):
         dq = n.up * (self.u1 * x.dq + self.slope * x.q) - n.back * x.dq0
         s = x.s0 + n.odd * x.e
         e = n.up * (self.d_middle * x.middle + self.d_chord * x.chord) - n.back * x.e0
+        chord = n.next * (self.d_chord * s - x.z_chord - self.half_cosine * dq)  # of the order of angle^2
+        chord = jnp.where(self.angle * n.odd < _short(s.dtype), self.angle**2 / 12 * self.d_chord * s, chord)
         return _BoundaryState(
             x.q, q, x.dq, dq, x.e, e, x.s, s,
             n.next * (self.d_middle * s - x.z_middle + self.weight * (2 * q + self.angle * dq)),
-            n.next * (self.d_chord * s - x.z_chord - self.half_cosine * dq),
+            chord,
             x.z_middle, x.z_middle0 + n.odd * x.middle, x.z_chord, x.z_chord0 + n.odd * x.chord,
         )  # fmt: skip
+
+
+def _short(dtype: jnp.dtype) -> float:
+    """Where the leading term of a difference is exact to as many digits as the difference keeps, about."""
+    return float(2e4 * jnp.finfo(dtype).eps) ** 0.25
 
 
 def _boundary(span: _Spans, d: Array) -> _Boundary:
@@ -574,7 +600,7 @@ def _boundary(span: _Spans, d: Array) -> _Boundary:
     return _Boundary(
         u0, u1,
         slope=rise * span.over_angle,
-        d_middle=0.5 * (u0 + u1) * span.over_half_cosine,
+        d_middle=0.5 * dot(span.middle, d) * span.over_half_cosine,
         d_chord=0.5 * rise * span.over_half_sine,
         weight=jnp.where(span.over_angle == 0, 0.5, span.half_sine * span.over_angle),
         angle=span.angle, half_cosine=1 / span.over_half_cosine,
@@ -603,12 +629,13 @@ def _sum_first(x: Array) -> Array:
     return functools.reduce(jnp.add, [x[i] for i in range(x.shape[0])])
 
 
-def _arctan_tail(t2: Array) -> Array:
-    """arctan(t)/t - 1 as a function of t^2, without cancellation."""
+def _arctan_parts(t2: Array) -> tuple[Array, Array]:
+    """arctan(t)/t - 1 and arctan(t)/t as functions of t^2, without cancellation."""
     small = t2 < 0.01
     x = jnp.where(small, t2, 0)
     series = jnp.zeros_like(x)
     for k in range(9, 0, -1):
         series = x * ((-1.0) ** k / (2 * k + 1) + series)
     t = jnp.sqrt(jnp.where(small, 1, t2))
-    return jnp.where(small, series, arctan2(t, jnp.ones_like(t)) / t - 1)
+    part = jnp.where(small, 1 + series, arctan2(t, jnp.ones_like(t)) / t)
+    return jnp.where(small, series, part - 1), part

@@ -11,23 +11,25 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._numerics import arctan2, cross, dot, normalize
+from shisd._numerics import arctan2, cross, dot, normalize, same_dtype
 from shisd._typing import Array, Float, Scalar
-from shisd.domains._moments import Loop
+from shisd.domains._moments import Loop, sides
 
 
 class SphericalPolygon(eqx.Module):
     """A region of the sphere bounded by great arcs between unit vertices.
 
     Arguments: `vertices` [slots, 3], unit vectors, each arc shorter than pi; `count`, how many of them are used (all,
-    unless given; it may be traced): the slots after them are padding, whatever they hold, NaN excepted.
+    unless given; it may be traced): the slots after them are padding, whatever they hold.
     Orientation: positive when counter-clockwise seen from outside the sphere, the interior on the left of every edge.
     Reversed winding changes the sign of every integral. Outlines need not be convex. Where an outline crosses itself,
     each part counts as often as the outline winds around it.
     A curve alone does not tell a polygon from the reversed outline of what is outside it: their integrals differ by
     those over the whole sphere. Solid angles are taken in (`largest` - 4 pi, `largest`], static, by default (-2 pi, 2
     pi]: every polygon that fits in a hemisphere, with the sign of its winding. For polygons that are larger than a
-    hemisphere pass largest = 4 pi: what is on the left of the edges.
+    hemisphere pass largest = 4 pi: what is on the left of the edges. Rounding never chooses between the ends of that
+    range: a great circle is 2 pi, both ways round, as each has a hemisphere on its left; an outline that surrounds
+    nothing is 0, also with largest = 4 pi.
     Bad input: fewer than three vertices or a wrong shape is a ValueError; vertices that are NaN or off the sphere by
     more than 1e-3, and arcs of length pi, which no plane determines, are errors in the functions of `domains`. Points
     in space become polygons with `polygon_from_points`.
@@ -37,14 +39,10 @@ class SphericalPolygon(eqx.Module):
     largest: float = eqx.field(static=True)
 
     def __init__(self, vertices: ArrayLike, count: ArrayLike | None = None, *, largest: float = 2 * np.pi):
-        v = _checks.vectors("vertices", vertices)
-        if v.ndim != 2 or v.shape[0] < 3:
-            raise ValueError(f"`vertices` must have shape [slots, 3] with at least 3 slots; got {list(v.shape)}.")
-        if isinstance(count, int | np.integer) and not 3 <= count <= v.shape[0]:
-            raise ValueError(f"`count` must be from 3 to the number of slots, {v.shape[0]}; got {count}.")
-        if not 0 < largest <= 4 * np.pi:
+        v = _checks.outline("vertices", vertices)
+        if not isinstance(largest, float | int | np.floating) or not 0 < largest <= 4 * np.pi:
             raise ValueError(f"`largest` must be a solid angle above 0 and at most 4 pi; got {largest}.")
-        self.vertices = v if count is None else v[jnp.minimum(np.arange(v.shape[0]), jnp.asarray(count) - 1)]
+        self.vertices = v if count is None else _used(v, count)
         self.largest = float(largest)
 
     @property
@@ -53,25 +51,37 @@ class SphericalPolygon(eqx.Module):
 
     def loop(self) -> Loop:
         """Checked unit vertices as [3, slots, 1]."""
-        v = self.vertices
-        length2 = jnp.sum(v * v, axis=1)
-        middle = v + jnp.roll(v, -1, axis=0)
+        v = self.vertices.T[..., None]
+        off = jnp.abs(dot(v, v) - 1)
+        middle = sides(v)[1]
         v = eqx.error_if(
             v,
-            ~jnp.all(jnp.abs(length2 - 1) < 2e-3),
-            "`vertices` of a polygon must be unit vectors: one is NaN or off the sphere. For points in space use "
-            "polygon_from_points.",
+            ~jnp.all(off < 2e-3),
+            "`vertices` of a polygon must be unit vectors: one is NaN or off the sphere, or `count` is out of range. "
+            "For points in space use polygon_from_points.",
         )
         v = eqx.error_if(
             v,
-            jnp.any(jnp.sum(middle * middle, axis=1) < 100 * jnp.finfo(v.dtype).eps ** 2),
+            jnp.any(dot(middle, middle) < 100 * jnp.finfo(v.dtype).eps ** 2),
             "Two consecutive `vertices` of a polygon are opposite: no arc is the shortest. Put a vertex between them.",
         )
         # Vertices that are unit to rounding stay as they are: to round them again would move small polygons.
-        unit = normalize(v)
-        rounded = jnp.abs(length2 - 1) < 8 * jnp.finfo(v.dtype).eps
-        value = jnp.where(rounded[:, None], v, unit)
-        return (jax.lax.stop_gradient(value - unit) + unit).T[..., None]
+        unit = on_sphere(v)
+        value = jnp.where((off < 8 * jnp.finfo(v.dtype).eps)[None], v, unit)
+        return jax.lax.stop_gradient(value - unit) + unit
+
+
+def _used(vertices: Float[Array, "slots 3"], count: ArrayLike) -> Float[Array, "slots 3"]:
+    """The first `count` vertices, the other slots filled with the last of them; NaN for a traced count out of range."""
+    slots = vertices.shape[0]
+    if not isinstance(count, jax.Array):
+        if _checks.integer("count", count, 3) > slots:
+            raise ValueError(f"`count` must be from 3 to the number of slots, {slots}; got {count}.")
+    elif count.ndim or not jnp.issubdtype(count.dtype, jnp.integer):
+        raise ValueError(f"`count` must be one integer; got {count.dtype} of shape {list(count.shape)}.")
+    n = jnp.asarray(count, jnp.int32)
+    last = jnp.minimum(np.arange(slots, dtype=np.int32), n - 1)
+    return jnp.where((n >= 3) & (n <= slots), vertices[last], jnp.nan)
 
 
 def polygon_from_points(
@@ -83,14 +93,17 @@ def polygon_from_points(
     `SphericalPolygon`. Counter-clockwise from outside the sphere is clockwise as seen from `origin`.
     Derivatives: in both, undefined (NaN) where a point coincides with `origin`. Points of a plane through `origin`
     cover nothing.
+    Accuracy: a difference is taken first, of NumPy arrays and lists in float64 whatever the result's dtype; how far
+    both are from the origin of space thus does not matter, beyond the rounding of the coordinates that are passed.
     """
-    p, o = _checks.vectors("points", points), _checks.vectors("origin", origin)
-    if p.ndim != 2 or p.shape[0] < 3 or o.shape != (3,):
-        raise ValueError(
-            f"`points` must be [slots, 3] with at least 3 slots and `origin` [3]; got {list(p.shape)}, {list(o.shape)}."
-        )
-    dtype = jnp.promote_types(p.dtype, o.dtype)
-    return SphericalPolygon(normalize(p.astype(dtype) - o.astype(dtype)[None]), count, largest=largest)
+    p, o = same_dtype(_checks.outline("points", points), _checks.vectors("origin", origin))
+    if o.shape != (3,):
+        raise ValueError(f"`origin` must have shape [3]; got {list(o.shape)}.")
+    if isinstance(points, jax.Array) or isinstance(origin, jax.Array):
+        relative = p - o[None]
+    else:
+        relative = jnp.asarray(np.asarray(points, float) - np.asarray(origin, float), p.dtype)
+    return SphericalPolygon(normalize(relative), count, largest=largest)
 
 
 def clip_to_hemisphere(polygon: SphericalPolygon, normal: ArrayLike) -> SphericalPolygon:
@@ -105,10 +118,15 @@ def clip_to_hemisphere(polygon: SphericalPolygon, normal: ArrayLike) -> Spherica
     n = _checks.vectors("normal", normal)
     if n.shape != (3,):
         raise ValueError(f"`normal` must have shape [3]; got {list(n.shape)}.")
-    v = polygon.loop()
-    n = normalize(n.astype(v.dtype))
-    clipped = clip(v, dot(v, n[:, None, None]))
-    return SphericalPolygon(normalize(clipped[..., 0].T), largest=polygon.largest)
+    return _clip(polygon, n)
+
+
+@eqx.filter_jit
+def _clip(polygon: SphericalPolygon, normal: Float[Array, "3"]) -> SphericalPolygon:
+    v, n = same_dtype(polygon.loop(), normalize(normal))
+    n = eqx.error_if(n, ~jnp.all(jnp.isfinite(n)), "`normal` is zero or not finite.")
+    clipped = on_sphere(clip(v, dot(v, n[:, None, None])))
+    return SphericalPolygon(clipped[..., 0].T, largest=polygon.largest)
 
 
 def solid_angle(polygon: SphericalPolygon) -> Scalar:
@@ -117,21 +135,37 @@ def solid_angle(polygon: SphericalPolygon) -> Scalar:
     Derivatives: in the vertices. Accuracy: relative 1e-12 in float64 and 1e-4 in float32, down to 1e-8 sr.
     Source: the angle of van Oosterom and Strackee 1983 for each triangle of a fan.
     """
+    return _solid_angle(polygon)
+
+
+@eqx.filter_jit
+def _solid_angle(polygon: SphericalPolygon) -> Scalar:
     return loop_solid_angle(polygon.loop(), polygon.largest)[0]
 
 
 def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | None = None) -> Float[Array, " p"]:
-    """Solid angles of loops. The fan starts at the first vertex, or where another is nearly opposite, at `fallback`."""
+    """Solid angles of loops, in (largest - 4 pi, largest] up to rounding.
+
+    The fan starts at the first vertex, or where another is nearly opposite, at `fallback`: where it is given, it is a
+    direction that no vertex is more than a quarter turn away from, and the fan adds up to what is meant.
+    """
     first = jax.lax.stop_gradient(v[:, 0])
     risky = jnp.min(dot(v, first[:, None]), axis=0) < -0.9
     other = _far_from_opposites(jax.lax.stop_gradient(v)) if fallback is None else jax.lax.stop_gradient(fallback)
     apex = jnp.where(risky[None], other, first)[:, None]
-    following = jnp.roll(v, -1, axis=1)
-    across = dot(apex - v, cross(v, following - v))
-    along = 1 + dot(apex, v) + dot(apex, following) + dot(v, following)
+    chord, middle = sides(v)
+    short = dot(chord, chord) < dot(middle, middle)
+    across = dot(apex - v, cross(v, jnp.where(short[None], chord, middle)))
+    along = dot(middle, apex + 0.5 * middle)
     angle = 2 * jnp.sum(arctan2(across, along), axis=0)
-    turns = jnp.floor((largest - angle) / (4 * np.pi))
-    return angle + (4 * np.pi) * jax.lax.stop_gradient(turns)
+    if fallback is not None:
+        return angle
+    # Both ends of the range are one outline, and rounding decides between them: a hemisphere is 2 pi, nothing is 0.
+    size = jnp.sum(jnp.sqrt(dot(apex - v, apex - v) * dot(chord, chord)), axis=0)
+    rounding = 16 * jnp.finfo(v.dtype).eps * size
+    from_lowest = angle - (largest - 4 * np.pi) + (rounding if largest > 2 * np.pi else -rounding)
+    turns = jnp.floor(jax.lax.stop_gradient(from_lowest) / (4 * np.pi))
+    return angle - (4 * np.pi) * turns
 
 
 def _far_from_opposites(v: Loop) -> Float[Array, "3 p"]:

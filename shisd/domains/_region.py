@@ -15,7 +15,7 @@ from shisd.harmonics._zh import legendre_of_versine
 class SphericalCap(eqx.Module):
     """The directions within `angle` of an axis.
 
-    Arguments: `axis` [3], of any length but zero; `angle` in rad, from 0 to pi.
+    Arguments: `axis` [3], of any length but zero; `angle` in rad, from 0 to pi. All integrals are NaN for others.
     """
 
     axis: Float[Array, "3"]
@@ -29,8 +29,9 @@ class SphericalCap(eqx.Module):
 
     @property
     def versine(self) -> Scalar:
-        """1 - cos(angle), without cancellation."""
-        return 2 * jnp.sin(self.angle / 2) ** 2
+        """1 - cos(angle), without cancellation; NaN where the angle is not from 0 to pi."""
+        bad = (self.angle < 0) | (self.angle > np.pi * (1 + 1e-6))  # as float32 rounds pi
+        return 2 * jnp.sin(self.angle / 2) ** 2 * jnp.where(bad, np.nan, jnp.ones_like(self.angle))
 
 
 def cap_integrals(versine: Float[Array, "*batch"], degree: int) -> Float[Array, "*batch l"]:

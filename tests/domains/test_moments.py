@@ -1,5 +1,6 @@
-"""Zonal and axial moments against area quadrature in extended precision."""
+"""Zonal and axial moments against quadrature in extended precision, with their derivatives."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,49 +10,119 @@ from jax.test_util import check_grads
 from shisd import domains
 from shisd.domains import _moments
 from tests import truth
-from tests.hard_cases import POLYGONS, axes_for, padded, random_polygon, unit
+from tests.hard_cases import AXES_AT_POLYGONS, HALF_TURNS, POLYGONS, TINY, axes_for, padded, random_polygon, unit
+
+DEGREE, AXES = 40, 9
+WEIGHTS = np.cos(np.arange(AXES * (DEGREE + 1))).reshape(AXES, -1)
+
+CASES = {name: (v, axes_for(v, np.random.default_rng(7))) for name, v in (POLYGONS | HALF_TURNS | TINY).items()}
+CASES |= {name: (v, np.tile(d, (AXES, 1))) for name, (v, d) in AXES_AT_POLYGONS.items()}
 
 
-def solid_angle(vertices):
-    return abs(truth.triangle_rule(vertices, 16)[1].sum().astype(float))
+@eqx.filter_jit
+def evaluated(vertices, axes, weights):
+    """Of all moments to degree 40 a weighted sum's gradients in vertices and axes, and the moments."""
+
+    def total(v, d):
+        moments = domains.zonal_moments(domains.SphericalPolygon(v), d, DEGREE)
+        return jnp.sum(moments * weights), moments
+
+    return jax.grad(total, (0, 1), has_aux=True)(vertices, axes)
 
 
-def moments_error(vertices, axes, degree, dtype, size=1.5):
-    """Largest error over the solid angle, against the polygon and the axes as rounded."""
+def derivatives(vertices, axes, size):
+    """Motions of vertices and of axes, two each, and the derivatives of the weighted sum along them."""
+    rng, v, d = np.random.default_rng(4), vertices.astype(np.longdouble), axes.astype(np.longdouble)
+    total = lambda v, d: np.sum(WEIGHTS * truth.edge_moments(v, d, DEGREE, 24))
+    least = min(size, float(np.min(np.linalg.norm(vertices + np.roll(vertices, -1, axis=0), axis=1))))
+    tries = [], []
+    for _ in range(2):
+        move, turn = rng.normal(size=v.shape), rng.normal(size=d.shape)
+        along = truth.derivative(lambda t: total(v + t * move, d), 2e-4 * least)  # noqa: B023
+        # padding repeats the first vertex, which moves with it
+        tries[0].append((padded(move), along))
+        tries[1].append((turn, truth.derivative(lambda t: total(v, d + t * turn), 3e-4)))  # noqa: B023
+    return tries
+
+
+LIMITS = {  # float32 and float64, of the polygon as float32 has it: values, derivatives in vertices and in axes
+    "coincident vertices": ((1e-06, 1e-06, 3e-06), (4e-15, 1e-13, 6e-13)),
+    "collinear vertices": ((1e-06, 1e-06, 9e-06), (4e-15, 6e-15, 2e-13)),
+    "edge near pi": ((4e-07, 6e-06, 7e-06), (8e-16, 7e-14, 8e-13)),
+    "sliver": ((1e-02, 1e-05, 9e-03), (1e-11, 2e-12, 1e-10)),  # 5e-5 wide: one rounding is 1e-3 of that in float32
+    "solid angle 1e-8": ((2e-06, 7e-05, 3e-05), (1e-12, 2e-11, 1e-11)),
+    "one degree square": ((2e-05, 5e-05, 3e-05), (1e-14, 2e-13, 9e-12)),
+    "non-convex": ((4e-06, 2e-05, 4e-06), (5e-15, 3e-14, 2e-13)),
+    "clockwise": ((1e-06, 3e-06, 5e-06), (2e-15, 4e-15, 3e-13)),
+    "near a hemisphere": ((9e-07, 1e-06, 5e-06), (2e-15, 3e-12, 1e-13)),
+    "edge 1e-01 rad short of pi": ((2e-06, 3e-06, 2e-05), (5e-15, 4e-14, 3e-13)),
+    "edge 1e-02 rad short of pi": ((3e-07, 5e-06, 2e-05), (1e-15, 7e-13, 1e-13)),
+    "edge 1e-03 rad short of pi": ((6e-07, 1e-05, 1e-05), (8e-14, 2e-12, 2e-13)),
+    "edge 1e-04 rad short of pi": ((7e-07, 5e-06, 1e-05), (1e-13, 3e-11, 4e-13)),
+    "edge 1e-05 rad short of pi": ((3e-07, 1e-05, 8e-06), (2e-11, 5e-10, 6e-11)),
+    "edge 1e-06 rad short of pi": (None, (7e-10, 7e-09, 5e-11)),  # refused in float32
+    "solid angle 2e-06": ((2e-06, 2e-05, 8e-06), (3e-14, 3e-13, 4e-12)),
+    "solid angle 2e-08": ((2e-06, 2e-06, 9e-06), (1e-12, 3e-12, 4e-12)),
+    "solid angle 2e-10": ((2e-06, 5e-05, 6e-06), (5e-12, 7e-11, 6e-12)),
+    "solid angle 2e-12": ((2e-06, 1e-05, 1e-05), (7e-11, 5e-10, 9e-11)),
+    "vertex at the axis": ((1e-06, 3e-05, 9e-06), (4e-15, 4e-14, 8e-13)),
+    "vertex opposite to the axis": ((1e-06, 2e-05, 1e-04), (4e-15, 3e-14, 4e-13)),
+    "axis in the plane of an edge": ((4e-07, 2e-07, 2e-06), (3e-15, 5e-15, 2e-13)),
+    "axis on an edge": ((3e-07, 2e-05, 9e-07), (3e-15, 3e-15, 2e-12)),
+    "axis normal to an edge": ((2e-07, 2e-06, 1e-05), (3e-15, 3e-15, 2e-13)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_values_and_derivatives(name):
+    """Of values over the solid angle, and of derivatives over the largest."""
+    vertices, axes = (x.astype(np.float32) for x in CASES[name])
+    exact = truth.edge_moments(vertices, axes, DEGREE, 24).astype(float)
+    whole = abs(exact[0, 0])
+    tries = derivatives(vertices, axes, np.sqrt(whole))
+    for dtype, limits in zip((np.float32, np.float64), LIMITS[name], strict=True):
+        with jax.enable_x64(dtype == np.float64):
+            arguments = padded(vertices).astype(dtype), axes.astype(dtype), WEIGHTS.astype(dtype)
+            if limits is None:
+                with pytest.raises(Exception, match="opposite"):
+                    evaluated(*arguments)
+                continue
+            gradients, got = evaluated(*arguments)
+        assert got.dtype == dtype
+        errors = [np.max(np.abs(np.asarray(got, float) - exact)) / whole]
+        for gradient, moves in zip(gradients, tries, strict=True):
+            slopes = np.array([(np.sum(np.asarray(gradient, float) * move), along) for move, along in moves], float)
+            errors.append(np.max(np.abs(slopes[:, 0] - slopes[:, 1])) / np.max(np.abs(slopes[:, 1])))
+        assert all(e <= limit for e, limit in zip(errors, limits, strict=True)), (dtype.__name__, errors, limits)
+
+
+def test_lines_along_edges_are_areas():
+    """The truth above and its solid angles against quadrature over areas, which shares nothing with it."""
+    for name in ("non-convex", "clockwise", "edge 1e-03 rad short of pi"):
+        vertices, axes = CASES[name]
+        by_area = truth.zonal_moments(vertices, axes, 12, 24)
+        by_line = truth.edge_moments(vertices, axes, 12, 24).astype(float)
+        np.testing.assert_allclose(by_line, by_area, atol=1e-14, err_msg=name)
+
+
+def moments_error(vertices, axes, dtype):
+    """The largest error over the solid angle to degree 100, for the polygon and the axes as rounded."""
     vertices, axes = vertices.astype(dtype), axes.astype(dtype)
-    got = domains.zonal_moments(domains.SphericalPolygon(padded(vertices)), axes, degree)
-    assert got.dtype == dtype and got.shape == (len(axes), degree + 1)
-    return np.max(
-        np.abs(got - truth.zonal_moments(vertices, axes, degree, 14 + int(0.4 * degree * size)))
-    ) / solid_angle(vertices)
+    got = domains.zonal_moments(domains.SphericalPolygon(padded(vertices)), axes, 100)
+    exact = truth.edge_moments(vertices, axes, 100, 60).astype(float)
+    return np.max(np.abs(np.asarray(got, float) - exact)) / abs(exact[0, 0])
 
 
-@pytest.mark.parametrize("size", [1.0, 0.3, 0.06, 1e-3])
-def test_moments_to_degree_100(size, dtype, rng):
-    errors = [
-        moments_error(random_polygon(rng, count, size), unit(rng.normal(size=(9, 3))), 100, dtype, size)
-        for count in (3, 4, 8, 3, 4, 8)
-    ]
-    double = 1e-13 if size > 0.05 else 1e-12
-    single = 2e-6 if size > 0.2 else 5e-5 if size > 0.05 else 1e-4
-    assert max(errors) < {"float64": double, "float32": single}[dtype.name]
-
-
-def test_small_triangles_to_degree_100_in_float32(rng):
-    """The rounding of P_l at the reference counts l times their size: rare cases are much worse than the median."""
-    axes, f = unit(rng.normal(size=(9, 3))).astype(np.float32), np.float32
-    errors = [moments_error(random_polygon(rng, 3, 0.08), axes, 100, f, 0.1) for _ in range(24)]
-    assert np.median(errors) < 2e-6 and max(errors) < 5e-5, (np.median(errors), max(errors))
-
-
-@pytest.mark.parametrize("name", POLYGONS)
-def test_hard_cases(name, dtype, rng):
-    """Rounding the vertices of an edge near pi turns its plane: truth is for the rounded polygon."""
-    vertices = POLYGONS[name]
-    bound = {"float64": 1e-12, "float32": 1e-4}[dtype.name]
-    if name in {"sliver", "solid angle 1e-8"}:
-        bound *= 30  # 5e-5 and 1e-4 wide: one rounding is 1e-3 of that in float32
-    assert moments_error(vertices, axes_for(vertices, rng), 40, dtype, 3.0) < bound
+def test_moments_to_degree_100(dtype, rng):
+    """At random, from large to small; 24 small triangles, since rare ones are much worse than the median."""
+    axes = unit(rng.normal(size=(9, 3)))
+    limits = {1.0: (1e-6, 1e-13), 0.3: (1e-5, 1e-13), 0.06: (1e-5, 1e-13), 1e-3: (1e-5, 1e-12)}
+    for size, limit in limits.items():
+        errors = [moments_error(random_polygon(rng, count, size), axes, dtype) for count in (3, 4, 8, 3, 4, 8)]
+        assert max(errors) < limit[dtype == np.float64], (size, errors)
+    if dtype == np.float32:
+        errors = [moments_error(random_polygon(rng, 3, 0.08), axes, dtype) for _ in range(24)]
+        assert np.median(errors) < 2e-6 and max(errors) < 1e-5, (np.median(errors), max(errors))
 
 
 def loss(vertices, axes, degree):
@@ -62,88 +133,44 @@ def loss(vertices, axes, degree):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", POLYGONS)
-def test_gradients_of_hard_cases_are_the_limit(name, x64, rng):
-    """Against differences of the quadrature, at coincident vertices and wherever axes and edges meet."""
-    vertices = POLYGONS[name]
-    axes, degree = axes_for(vertices, rng), 12
-    scale = min(1.0, np.sqrt(solid_angle(vertices)))
-    weights = np.cos(np.arange(len(axes) * (degree + 1))).reshape(len(axes), -1)
-    nodes = 60 if name in {"edge near pi", "near a hemisphere"} else 16
-    value = lambda v, d: float(np.sum(weights * truth.zonal_moments(v, d, degree, nodes)))
-    gradient, axis_gradient = jax.jit(jax.grad(loss, (0, 1)), static_argnums=2)(padded(vertices), axes, degree)
-    for _ in range(2):
-        step = rng.normal(size=vertices.shape)
-        step -= np.sum(step * vertices, axis=1, keepdims=True) * vertices
-        h = 1e-4 * scale
-        along = lambda s: value(unit(vertices + s * h * step), axes)  # noqa: B023
-        expected = (8 * (along(1) - along(-1)) - (along(2) - along(-2))) / (12 * h)
-        # padding repeats the first vertex, which the quadrature moves along with it
-        moved = padded(step)
-        np.testing.assert_allclose(np.sum(gradient * moved), expected, rtol=1e-6, atol=1e-7 * scale)
-    step = rng.normal(size=axes.shape)
-    along = lambda s: value(vertices, unit(axes + s * 1e-4 * step))
-    expected = (8 * (along(1) - along(-1)) - (along(2) - along(-2))) / 12e-4
-    np.testing.assert_allclose(np.sum(axis_gradient * step), expected, rtol=1e-6, atol=1e-7 * scale**2)
-
-
-@pytest.mark.slow
 def test_second_derivatives_and_both_modes(x64, rng):
     vertices, axes = random_polygon(rng, 4, 0.8), unit(rng.normal(size=(2, 3)))
     check_grads(lambda v, d: loss(v, d, 3), (vertices, axes), order=2, rtol=1e-5, atol=1e-6)
 
 
-def test_a_whole_and_its_parts(dtype, rng):
+def test_wholes_parts_and_outsides(dtype, rng):
+    """Parts add up, winding is a sign, the outside of a polygon is the sphere without it, and octants are the sphere.
+
+    All about nine axes to degree 100, where one function is compiled already.
+    """
     v = random_polygon(rng, 4, 1.0).astype(dtype)
-    axes = unit(rng.normal(size=(5, 3))).astype(dtype)
-    m = lambda x: np.asarray(domains.zonal_moments(domains.SphericalPolygon(padded(x)), axes, 20))
-    tolerance = {"float64": 1e-13, "float32": 2e-5}[dtype.name]
+    axes = unit(rng.normal(size=(9, 3))).astype(dtype)
+    m = lambda x, **options: np.asarray(
+        domains.zonal_moments(domains.SphericalPolygon(padded(x), **options), axes, 100), float
+    )
+    tolerance, sphere = {"float64": 1e-13, "float32": 2e-5}[dtype.name], 4 * np.pi * np.eye(101)[:1]
     np.testing.assert_allclose(m(v), m(v[[0, 1, 2]]) + m(v[[0, 2, 3]]), atol=tolerance)
     np.testing.assert_allclose(m(v[::-1]), -m(v), atol=tolerance)
     np.testing.assert_allclose(m(np.roll(v, 1, axis=0)), m(v), atol=tolerance)
-
-
-def test_the_outside_of_a_polygon(dtype, rng):
-    """More than a hemisphere: reversed, it is the sphere without the polygon."""
-    v = random_polygon(rng, 4, 0.7).astype(dtype)
-    axes = unit(rng.normal(size=(5, 3))).astype(dtype)
-    inside = domains.zonal_moments(domains.SphericalPolygon(padded(v)), axes, 20)
-    outside = domains.zonal_moments(domains.SphericalPolygon(padded(v[::-1]), largest=4 * np.pi), axes, 20)
-    whole = 4 * np.pi * np.eye(21)[0]
-    tolerance = {"float64": 1e-13, "float32": 2e-5}[dtype.name]
-    np.testing.assert_allclose(np.asarray(inside) + np.asarray(outside), np.tile(whole, (5, 1)), atol=tolerance)
-
-
-def test_the_octants_cover_the_sphere(dtype):
-    """Zero for l > 0, and 4 pi, whatever the axis; every edge is a quarter circle."""
-    axes = unit([[0, 0, 1], [1, 2, 3], [-1, 0.5, 0]]).astype(dtype)
-    total = 0
-    for sx in (1, -1):
-        for sy in (1, -1):
-            for sz in (1, -1):
-                v = np.diag([sx, sy, sz]).astype(dtype)
-                v = v if sx * sy * sz > 0 else v[::-1]
-                total = total + np.asarray(domains.zonal_moments(domains.SphericalPolygon(padded(v)), axes, 30))
-    expected = np.zeros((3, 31))
-    expected[:, 0] = 4 * np.pi
-    np.testing.assert_allclose(total, expected, atol={"float64": 1e-14, "float32": 1e-5}[dtype.name])
+    np.testing.assert_allclose(m(v[::-1], largest=4 * np.pi) + m(v), sphere.repeat(9, 0), atol=tolerance)
+    signs = [(x, y, z) for x in (1, -1) for y in (1, -1) for z in (1, -1)]
+    octants = [np.diag(s).astype(dtype)[:: np.prod(s)] for s in signs]
+    np.testing.assert_allclose(sum(map(m, octants)), sphere.repeat(9, 0), atol=tolerance)
 
 
 def test_powers_against_quadrature_and_closed_values(dtype, rng):
-    """Arvo's closed value: over an octant, the integral of z is pi/4 and of z^2 is pi/6."""
-    octant = domains.SphericalPolygon(np.eye(3, dtype=dtype))
-    tolerance = {"float64": 1e-14, "float32": 1e-6}[dtype.name]
-    z = np.asarray([[0, 0, 1]], dtype)
+    """Over an octant the integral of z^n is pi/2 / (n+1), of which Arvo has n = 1 and 2."""
+    tolerance, z = {"float64": 1e-14, "float32": 1e-6}[dtype.name], np.asarray([[0, 0, 1]] * 4, dtype)
+    m = lambda v, d: np.asarray(domains.axial_moments(domains.SphericalPolygon(padded(v)), d, 80))
     np.testing.assert_allclose(
-        domains.axial_moments(octant, z, 2)[0], [np.pi / 2, np.pi / 4, np.pi / 6], rtol=tolerance
+        m(np.eye(3, dtype=dtype), z), np.tile(np.pi / 2 / np.arange(1, 82), (4, 1)), rtol=5 * tolerance
     )
     v, axes = random_polygon(rng, 5, 1.0).astype(dtype), unit(rng.normal(size=(4, 3))).astype(dtype)
     w, area = truth.triangle_rule(v, 24)
     d = np.asarray(axes, np.longdouble)
     cosine = w @ (d / np.sqrt(np.sum(d * d, axis=1, keepdims=True))).T
     expected = np.einsum("p,pkn->kn", area, cosine[..., None] ** np.arange(21)).astype(float)
-    got = domains.axial_moments(domains.SphericalPolygon(padded(v)), axes, 20)
-    np.testing.assert_allclose(got, expected, atol=5 * tolerance)
+    np.testing.assert_allclose(m(v, axes)[:, :21], expected, atol=5 * tolerance)
 
 
 @pytest.mark.slow
@@ -153,6 +180,19 @@ def test_powers_differentiate(x64, rng):
     check_grads(
         lambda v, d: domains.axial_moments(domains.SphericalPolygon(norm(v)), d, 4), (v, axes), 1, rtol=1e-6, atol=1e-8
     )
+
+
+def test_fold_agrees_with_moments(x64, rng):
+    """The unrolled sweep of a weighted sum, its value and its gradient in the outline, at degree 7."""
+    v = np.stack([random_polygon(rng, 4, s) for s in (1.0, 0.01)]).transpose(2, 1, 0)
+    v, axes, w = jnp.asarray(v), jnp.asarray(unit(rng.normal(size=(3, 3)))), jnp.asarray(rng.normal(size=(3, 8, 1)))
+    l = np.arange(1.0, 8)
+    folded = lambda v: _moments.fold(w, axes, v, 7)
+    summed = lambda v: jnp.einsum("lkp,klq,l->p", _moments.moments(axes, v, 7), w[:, 1:], l * (l + 1))
+    (got, back), (expected, back_expected) = (jax.vjp(jax.jit(f), v) for f in (folded, summed))
+    gradient, expected_gradient = back(jnp.ones(2))[0], back_expected(jnp.ones(2))[0]
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    np.testing.assert_allclose(gradient, expected_gradient, atol=1e-11)
 
 
 @pytest.mark.slow

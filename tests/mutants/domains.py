@@ -1,0 +1,116 @@
+"""Mutants of the regions and their integrals: what the tests named have to catch."""
+
+from tests.mutants import Mutant
+
+_MOMENTS, _POLYGON = "shisd/domains/_moments.py", "shisd/domains/_polygon.py"
+_CASE = "tests/domains/test_moments.py::test_values_and_derivatives"
+
+MUTANTS = [
+    Mutant(
+        "no gradient of moments in the outline", _MOMENTS,
+        old="return -jax.lax.scan(step, terms.start()", new="return 0 * jax.lax.scan(step, terms.start()",
+        test=f"{_CASE}[non-convex]",
+    ),
+    Mutant(
+        "no gradient of moments in the axes", _MOMENTS,
+        old="(axes,), (d_axes,))\n    if", new="(axes,), (0 * d_axes,))\n    if",
+        test=f"{_CASE}[non-convex]",
+    ),
+    Mutant(
+        "no gradient of sums of moments in the outline", _MOMENTS,
+        old="change -= _sum_first(speed * weight)", new="change -= _sum_first(0 * speed * weight)",
+        test="tests/domains/test_moments.py::test_fold_agrees_with_moments",
+    ),
+    Mutant(
+        "lengths tilt the middle of an edge", _MOMENTS,
+        old="return upright, middle - jnp.where(short, 0, tilt)[None] * chord", new="return upright, middle",
+        test=f"{_CASE}[edge 1e-03 rad short of pi]",
+    ),
+    Mutant(
+        "lengths tilt a short edge", _MOMENTS,
+        old="upright = chord - jnp.where(short, tilt, 0)[None] * middle", new="upright = chord",
+        test=f"{_CASE}[solid angle 2e-12]",
+    ),
+    Mutant(
+        "a sum of ends where they cancel", _MOMENTS,
+        old="dot(edge.middle, d), dot(edge.normal, d)", new="u0 + u1, dot(edge.normal, d)",
+        test=f"{_CASE}[edge 1e-03 rad short of pi]",
+    ),
+    Mutant(
+        "a difference of line integrals where it cancels", _MOMENTS,
+        old=".eps) ** 0.25", new=".eps) * 0",
+        test=f"{_CASE}[solid angle 2e-12]",
+    ),
+    Mutant(
+        "an angle over its tangent from what it lacks to 1", _MOMENTS,
+        old="return jnp.where(small, series, part - 1), part",
+        new="tail = jnp.where(small, series, part - 1)\n    return tail, 1 + tail",
+        test=f"{_CASE}[edge 1e-04 rad short of pi]",
+    ),
+    Mutant(
+        "short edges are points", _MOMENTS,
+        old="1e4 * jnp.finfo(t2.dtype).tiny", new="(64 * jnp.finfo(t2.dtype).eps) ** 2",
+        test=f"{_CASE}[solid angle 2e-12]",
+    ),
+    Mutant(
+        "cosine powers without the edge's plane", _MOMENTS,
+        old="(n - 1) * (1 - x.g2) * f0", new="(n - 1) * f0",
+        test="tests/domains/test_moments.py::test_powers_against_quadrature_and_closed_values[float32]",
+    ),
+    Mutant(
+        "a NumPy scalar in the constant", "shisd/domains/_integrate.py",
+        old="solid_angle * math.sqrt(", new="solid_angle * np.sqrt(",
+        test="tests/domains/test_polygon.py::test_float32_stays_float32_with_x64_on",
+    ),
+    Mutant(
+        "reversed winding of points", _POLYGON,
+        old="SphericalPolygon(normalize(relative), count", new="SphericalPolygon(normalize(relative)[::-1], count",
+        test="tests/domains/test_polygon.py::test_polygons_from_points[float32]",
+    ),
+    Mutant(
+        "coordinates of NumPy rounded before they are subtracted", _POLYGON,
+        old="if isinstance(points, jax.Array) or", new="if True or",
+        test="tests/domains/test_polygon.py::test_points_of_numpy_are_subtracted_as_they_are",
+    ),
+    Mutant(
+        "a great circle by rounding", _POLYGON,
+        old="else -rounding)", new="else rounding)",
+        test="tests/domains/test_polygon.py::test_a_great_circle_is_a_hemisphere[float32-12]",
+    ),
+    Mutant(
+        "a small polygon is the sphere", _POLYGON,
+        old="turns = jnp.floor(jax.lax.stop_gradient(from_lowest) / (4 * np.pi))",
+        new="turns = -jnp.floor((largest - jax.lax.stop_gradient(angle)) / (4 * np.pi))",
+        test="tests/domains/test_polygon.py::test_small_and_nearly_whole[float32-solid angle 2e-08]",
+    ),
+    Mutant(
+        "a traced count below 3", _POLYGON,
+        old="jnp.where((n >= 3) & (n <= slots), vertices[last], jnp.nan)", new="vertices[last]",
+        test="tests/domains/test_polygon.py::test_padding_and_traced_counts",
+    ),
+    Mutant(
+        "the part below", _POLYGON,
+        old="inside = height > 0", new="inside = height < 0",
+        test="tests/domains/test_polygon.py::test_clipping_keeps_what_is_above[non-convex-float64]",
+    ),
+    Mutant(
+        "edges cut in the middle", _POLYGON,
+        old="part = height / jnp.where(crosses, height - height_next, 1)", new="part = 0.5 + 0 * height",
+        test="tests/domains/test_polygon.py::test_clipping_keeps_what_is_above[non-convex-float64]",
+    ),
+    Mutant(
+        "a cap of 4 rad", "shisd/domains/_region.py",
+        old="bad = (self.angle < 0) | (self.angle > np.pi * (1 + 1e-6))", new="bad = self.angle < 0",
+        test="tests/domains/test_integrate.py::test_what_is_no_angle_is_nan[4.0]",
+    ),
+    Mutant(
+        "a cell for what is no direction", "shisd/domains/_haar.py",
+        old="jnp.isnan(normalize(w)).any(axis=1)", new="jnp.zeros(len(w), bool)",
+        test="tests/domains/test_haar.py::test_no_direction_has_no_value",
+    ),
+    Mutant(
+        "cells cut on the wrong side", "shisd/domains/_haar.py",
+        old="corners[odd] = corners[odd][:, ::-1]", new="corners[odd] = corners[odd][:, ::1]",
+        test="tests/domains/test_haar.py::test_a_direction_finds_its_cell",
+    ),
+]  # fmt: skip
