@@ -1,9 +1,12 @@
 """Files: read what others write, refuse what is broken, never overwrite unasked or halfway."""
 
+import argparse
 import os
+import re
 import struct
 import sys
 import threading
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -557,3 +560,40 @@ def test_files_that_promise_more_than_they_hold(tmp_path):
     (tmp_path / "a.npz").write_bytes(pickled.getvalue())
     with pytest.raises(ValueError, match="a is not of the size"):
         io.read_npz(tmp_path / "a.npz", ["a"])
+
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+
+def test_no_example_takes_a_folder_that_it_did_not_make(tmp_path, monkeypatch, capsys):
+    """Least of all that of the examples, whose results are called like the files that come with them."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import _scene
+
+    names = [path.stem for path in EXAMPLES.glob("*.py") if "_scene.prepare_output(" in path.read_text()]
+    assert len(names) >= 8
+    for name in names:
+        text = (EXAMPLES / f"{name}.py").read_text()
+        assert re.findall(r"prepare_output\(options.output, options.overwrite, \"(.*)\", parser\)", text) == [name]
+    assert not re.search("rmtree|unlink|os.remove|rmdir", "".join(path.read_text() for path in EXAMPLES.glob("*.py")))
+
+    parser = argparse.ArgumentParser()
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for path in EXAMPLES.iterdir():
+        (folder / path.name).write_text("keep me")
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    for name in names:
+        for overwrite, message in ((True, "left alone"), (False, "exists")):
+            with pytest.raises(SystemExit):
+                _scene.prepare_output(folder, overwrite, name, parser)
+            assert message in capsys.readouterr().err
+    assert before == {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+    own = tmp_path / "new" / "own"
+    _scene.prepare_output(own, False, "relight", parser)
+    (own / "letter.txt").write_text("keep me")
+    _scene.prepare_output(own, True, "relight", parser)
+    with pytest.raises(SystemExit):
+        _scene.prepare_output(own, True, "denoise", parser)
+    assert (own / "letter.txt").read_text() == "keep me"

@@ -30,14 +30,16 @@ def ordinary(path: StrPath) -> Path:
     return path
 
 
-def write_atomically(path: StrPath, write: Callable[[IO[bytes]], object], *, overwrite: bool = False) -> None:
+def write_atomically(
+    path: StrPath, content: str | Callable[[IO[bytes]], object], *, overwrite: bool = False
+) -> None:
     """Write a file that is there completely or not at all.
 
-    `write` gets a binary file, a new one beside `path`, which takes its place once it is on the disk. What stood at
-    `path` is whole until then, and stays so when `write` raises or the program is stopped. Without `overwrite` one of
-    several writers succeeds. A link is replaced, never written through.
+    `content` is the text, or a function that gets a binary file to write to: a new one beside `path`, which takes its
+    place once it is on the disk. What stood at `path` is whole until then, and stays so when the function raises or the
+    program is stopped. Without `overwrite` one of several writers succeeds. A link is replaced, never written through.
     Errors: FileExistsError unless `overwrite=True`; ValueError where `path` is a folder, pipe or device; OSError with
-    `path` for what the system refuses; those of `write`.
+    `path` for what the system refuses; those of the function.
     """
     path = Path(path)
     refuse_existing(path, overwrite)
@@ -46,7 +48,7 @@ def write_atomically(path: StrPath, write: Callable[[IO[bytes]], object], *, ove
     beside = path.with_name(f".{secrets.token_hex(8)}.part")
     try:
         with beside.open("xb") as file:
-            write(file)
+            file.write(content.encode()) if isinstance(content, str) else content(file)
             file.flush()
             os.fsync(file.fileno())
         if not overwrite:
