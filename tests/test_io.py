@@ -6,6 +6,7 @@ import re
 import struct
 import sys
 import threading
+import tracemalloc
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -227,6 +228,19 @@ def test_what_is_no_ordinary_file_or_of_no_plausible_size(tmp_path):
         io.read_image(path)
 
 
+def test_memory_beside_a_large_picture(tmp_path):
+    """A file that unfolds to 190 times its size is read some rows at a time; all at once would take 100 MB."""
+    height, width = 60, 32767
+    run = b"".join(bytes([128 + min(127, width - at), 130]) for at in range(0, width, 127))
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\n\n-Y 60 +X 32767\n" + height * (b"\x02\x02\x7f\xff" + 4 * run))
+    tracemalloc.start()
+    image = io.read_image(tmp_path / "a.hdr")
+    peak = tracemalloc.get_traced_memory()[1] - image.nbytes
+    tracemalloc.stop()
+    assert image.shape == (height, width, 3) and np.all(image == np.float32(130 * 2.0**-6))
+    assert peak < 40e6, f"{peak / 1e6:.1f} MB"  # 18 MB measured
+
+
 def test_pixels_that_are_not_square_are_mentioned(tmp_path):
     import OpenEXR
 
@@ -289,6 +303,7 @@ TWO = {**colour("diffuse.", 5, ("red", "green", "blue", "alpha")), **colour("spe
         ([("left", colour("", 1)), ("right", colour("", 2))], "right", 2),
         ([("", VIEWS)], None, 3),
         ([("", VIEWS)], "ViewLayer.Depth", 9),
+        ([("beauty", colour("ViewLayer.Combined.", 3)), ("depth", DEPTH)], "ViewLayer.Combined", 3),
         ([("", TWO)], "diffuse", 5),
         ([("", TWO)], "specular", 6),
         ([("", {**TWO, **colour("", 4, ("R", "G", "B", "A"))})], None, 4),

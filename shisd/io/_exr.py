@@ -35,17 +35,20 @@ class _Layer:
 
 def read(path: Path, layer: str | None) -> np.ndarray:
     openexr = optional("OpenEXR", "the package OpenEXR")
+    try:
+        return _read(openexr, path, layer)
+    except (IndexError, KeyError, UnicodeDecodeError) as error:  # the package goes on without what it could not read
+        raise ValueError(f"{path}: truncated or damaged: {error!r}. Get or save it again.") from error
+
+
+def _read(openexr: Any, path: Path, layer: str | None) -> np.ndarray:
     with _opened(openexr, path, header_only=True) as file:
         chosen = _choose(path, file, layer)
-        header = dict(file.parts[chosen.part].header)
-        _check(path, file, header, chosen)
+        _check(path, file, chosen)
     with _opened(openexr, path, header_only=False) as file:
+        part = {part.part_index: part for part in file.parts}[chosen.part]
         names = [chosen.channels[short].name for short in chosen.picture]
-        try:  # the package goes on without the parts and pixels that it could not read
-            part = {part.part_index: part for part in file.parts}[chosen.part]
-            planes = [part.channels[name].pixels for name in names]
-        except (IndexError, KeyError) as error:
-            raise ValueError(f"{path}: truncated or damaged: its pixels are not there. Get it again.") from error
+        planes = [part.channels[name].pixels for name in names]
         if any(plane.ndim != 2 or plane.shape != planes[0].shape for plane in planes):
             raise ValueError(f"{path}: damaged: its channels are not those of its header. Get or save it again.")
         if any(plane.dtype.kind != "f" for plane in planes):
@@ -99,8 +102,9 @@ def _names(layers: list[_Layer]) -> str:
     return ", ".join(repr(layer.name) for layer in layers) or "none"
 
 
-def _check(path: Path, file: Any, header: dict[str, Any], chosen: _Layer) -> None:
+def _check(path: Path, file: Any, chosen: _Layer) -> None:
     """Refuse what is no whole picture, and sizes that such a file cannot hold."""
+    header = file.parts[chosen.part].header
     channels = [chosen.channels[short] for short in chosen.picture]
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels):
         names = ", ".join(channel.name for channel in channels)
