@@ -4,6 +4,7 @@ import csv
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 import _scene
@@ -166,10 +167,11 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["parameter", "truth", "found", "error %", *(f"noisy {k}" for k in range(len(rows[0].noisy)))])
-        writer.writerows([r.parameter, r.truth, r.found, r.error, *r.noisy] for r in rows)
+    text = StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["parameter", "truth", "found", "error %", *(f"noisy {k}" for k in range(len(rows[0].noisy)))])
+    writer.writerows([r.parameter, r.truth, r.found, r.error, *r.noisy] for r in rows)
+    io.write_atomically(path, text.getvalue(), overwrite=True)
 
 
 def sheet(
@@ -216,5 +218,7 @@ def sheet(
         axes.grid(color=ink, alpha=0.15, linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=7.5, loc="lower left", labelcolor=ink)
-        figure.savefig(path, dpi=120, facecolor=paper)
+        io.write_atomically(
+            path, lambda file: figure.savefig(file, format="png", dpi=120, facecolor=paper), overwrite=True
+        )
         pyplot.close(figure)

@@ -1,11 +1,12 @@
 """What a picture needs besides shading: a camera, an object's visible points, pixels in their places, and a folder."""
 
 import argparse
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from shisd import io
 
 
 @dataclass
@@ -34,19 +35,24 @@ def output_parser(text: str, name: str) -> argparse.ArgumentParser:
     """A parser that shows the text of a program, with the options that `prepare_output` is for."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("output") / name, help="folder for what is made")
-    parser.add_argument("--overwrite", action="store_true", help="replace the output folder if it exists")
+    parser.add_argument("--overwrite", action="store_true", help="replace files in the output folder if it exists")
     return parser
 
 
-def prepare_output(folder: Path, overwrite: bool, mark: str, parser: argparse.ArgumentParser) -> None:
-    """An empty folder. One that exists is replaced only when asked, and only if it holds `mark` or nothing."""
+def prepare_output(folder: Path, overwrite: bool, name: str, parser: argparse.ArgumentParser) -> None:
+    """A folder with the mark of the program `name`, a hidden file that only this function makes.
+
+    One that exists is taken only when asked, and only if it has the mark or is empty. Nothing is removed: what the
+    program writes then replaces what is called alike.
+    """
+    mark = folder / f".made-by-{name}"
     if folder.exists():
         if not overwrite:
-            parser.error(f"{folder} exists. Name another --output, or replace it with --overwrite.")
-        if not (folder / mark).exists() and any(folder.iterdir()):
-            parser.error(f"{folder} was not written by this program and is left alone. Name another --output.")
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
+            parser.error(f"{folder} exists. Name another --output, or replace its files with --overwrite.")
+        if not folder.is_dir() or not (mark.is_file() or not any(folder.iterdir())):
+            parser.error(f"{folder} was not made by this program and is left alone. Name another --output.")
+    folder.mkdir(parents=True, exist_ok=True)
+    io.write_atomically(mark, f"Files here may be replaced by {name}.py --overwrite.\n", overwrite=True)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

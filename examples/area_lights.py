@@ -150,7 +150,7 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
         error = np.linalg.norm(images[name] - truths[name], axis=1) / np.linalg.norm(truths[name], axis=1).mean()
         false = plotting.false_colour(error, limits=(BEST, WORST)).reshape(*shape, 3)
         panels[name] = show(images[name], name), show(truths[name], name), false
-        io.write_image(output / f"{name}.png", np.concatenate(panels[name], axis=1))
+        io.write_image(output / f"{name}.png", np.concatenate(panels[name], axis=1), overwrite=True)
     sheet(output / "area_lights.png", panels)
     return rows
 
@@ -188,7 +188,9 @@ def sheet(path: Path, panels: dict) -> None:
         scale.set_xticks([-6, -4, -2], ["1e-6", "1e-4", "1e-2"], color=ink, fontsize=7)
         scale.tick_params(length=0, pad=1)
         figure.text(0.665, 0.22 / height, "error / mean radiance", ha="right", fontsize=8)
-        figure.savefig(path, dpi=110, facecolor=paper)
+        io.write_atomically(
+            path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper), overwrite=True
+        )
         pyplot.close(figure)
 
 
@@ -219,11 +221,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=int, default=192, help="width of a picture in pixels")
     parser.add_argument("--nodes", type=int, default=16, help="Gauss nodes along each side of a triangle")
     options = parser.parse_args(arguments)
-    _scene.prepare_output(options.output, options.overwrite, "area_lights.md", parser)
+    _scene.prepare_output(options.output, options.overwrite, "area_lights", parser)
     start = time.perf_counter()
     rows = run(options.output, options.size, options.nodes)
     text = table(rows, options.nodes)
-    (options.output / "area_lights.md").write_text(text + "\n")
+    io.write_atomically(options.output / "area_lights.md", text + "\n", overwrite=True)
     print(text)
     check(rows)
     print(f"\n{time.perf_counter() - start:.0f} s, pictures in {options.output}/.")

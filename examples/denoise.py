@@ -39,9 +39,9 @@ def lit(brdf: models.AbstractBrdf, view: _scene.View) -> jax.Array:
 
 def run(output: Path, size: int, noise: float, holes: float, seed: int) -> list[dict]:
     clean, spoiled = output / "clean.binary", output / "spoiled.binary"
-    io.write_merl(clean, gold_metallic_paint())
+    io.write_merl(clean, gold_metallic_paint(), overwrite=True)
     truth = io.read_merl(clean)
-    io.write_merl(spoiled, spoil(truth, noise, holes, seed))
+    io.write_merl(spoiled, spoil(truth, noise, holes, seed), overwrite=True)
     with warnings.catch_warnings(record=True):  # it says how many bins are missing
         warnings.simplefilter("always")
         materials = {"as read": models.MeasuredBrdf.from_merl(spoiled)}
@@ -53,7 +53,7 @@ def run(output: Path, size: int, noise: float, holes: float, seed: int) -> list[
     panels = [io.tonemap(view.picture(image), exposure=EXPOSURE) for image in images.values()]
     errors = (np.abs(images[name] - images["clean"]) for name in ("as read", "denoised"))
     panels += [io.tonemap(view.picture(5 * error), exposure=EXPOSURE) for error in errors]
-    io.write_image(output / "denoise.png", np.concatenate(panels, axis=1))
+    io.write_image(output / "denoise.png", np.concatenate(panels, axis=1), overwrite=True)
 
     above = io.merl_above_horizon()
     rms = lambda x: np.sqrt(np.mean(np.square(x)))
@@ -80,9 +80,9 @@ def main() -> None:
     parser.add_argument("--holes", type=float, default=0.5, help="share of the bins that are missing")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    _scene.prepare_output(options.output, options.overwrite, "denoise.md", parser)
+    _scene.prepare_output(options.output, options.overwrite, "denoise", parser)
     rows = run(options.output, options.size, options.noise, options.holes, options.seed)
-    (options.output / "denoise.md").write_text(table(rows) + "\n")
+    io.write_atomically(options.output / "denoise.md", table(rows) + "\n", overwrite=True)
     print(table(rows))
     if rows[1]["table"] > rows[0]["table"] / 3:
         raise SystemExit("The denoised table should be at least three times nearer to the clean one.")

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from shisd import decomposition, models, shading
+from shisd import decomposition, io, models, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 LIGHT_DEGREE = 3
@@ -152,13 +152,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=25, help="most steps from one start")
     parser.add_argument("--noisy", type=int, default=2, help="fits to pictures with noise")
     options = parser.parse_args(arguments)
-    _scene.prepare_output(options.output, options.overwrite, "fit_light.md", parser)
+    _scene.prepare_output(options.output, options.overwrite, "fit_light", parser)
     start = time.perf_counter()
     with jax.enable_x64(True):  # the linear part squares rounding: its unknowns differ in effect by a hundred
         rows = run(options.output, options.size, options.steps, options.noisy)
     _fit.write_csv(options.output / "fit_light.csv", rows)
     text = table(rows)
-    (options.output / "fit_light.md").write_text(text + "\n")
+    io.write_atomically(options.output / "fit_light.md", text + "\n", overwrite=True)
     print(text)
     assert rows[0].error < 1, f"the lamp is {rows[0].error:.2g} % of its distance from its place"
     print(f"\n{time.perf_counter() - start:.0f} s, picture in {options.output}/.")

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, models, shading
+from shisd import decomposition, io, models, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 NAMES = "alpha along x", "alpha along y", "albedo, red", "albedo, green", "albedo, blue", "specular"
@@ -126,12 +126,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=30, help="most steps of one fit at one degree")
     parser.add_argument("--noisy", type=int, default=2, help="fits to pictures with noise")
     options = parser.parse_args(arguments)
-    _scene.prepare_output(options.output, options.overwrite, "fit_material.md", parser)
+    _scene.prepare_output(options.output, options.overwrite, "fit_material", parser)
     start = time.perf_counter()
     rows, report = run(options.output, options.size, options.degree, options.steps, options.noisy)
     _fit.write_csv(options.output / "fit_material.csv", rows)
     text = table(rows, options.degree)
-    (options.output / "fit_material.md").write_text(text + "\n")
+    io.write_atomically(options.output / "fit_material.md", text + "\n", overwrite=True)
     print(text)
     for row in rows:
         assert row.error < 2, f"{row.parameter}: {row.error:.2g} % from the truth"

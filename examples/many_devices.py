@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from shisd import decomposition, models, shading
+from shisd import decomposition, io, models, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
@@ -237,11 +237,11 @@ def main(arguments: list[str] | None = None) -> None:
     counts = {1, options.processes, *options.devices}
     if any(max(counts) % count for count in counts):
         parser.error(f"the largest number of devices must be divisible by all: {sorted(counts)}.")
-    _scene.prepare_output(options.output, options.overwrite, "many_devices.md", parser)
+    _scene.prepare_output(options.output, options.overwrite, "many_devices", parser)
     start = time.perf_counter()
     rows = run(options.degree, options.pixels, options.devices, options.processes)
     text = table(rows, options.degree, options.pixels)
-    (options.output / "many_devices.md").write_text(text + "\n")
+    io.write_atomically(options.output / "many_devices.md", text + "\n", overwrite=True)
     print(text)
     check(rows)
     print(f"\nAll runs agree with one device. {time.perf_counter() - start:.0f} s, table in {options.output}/.")

@@ -68,7 +68,7 @@ def run(output: Path, size: int) -> list[dict]:
                 row["rms"] = np.sqrt(np.mean(error**2) / np.mean(scale**2))
                 rows.append({**row, "median": np.median(error / np.maximum(scale, 1e-6))})
     picture = np.concatenate(gallery, axis=0)
-    io.write_image(output / "mirror.png", np.repeat(np.repeat(picture, 3, axis=0), 3, axis=1))
+    io.write_image(output / "mirror.png", np.repeat(np.repeat(picture, 3, axis=0), 3, axis=1), overwrite=True)
     return rows
 
 
@@ -86,9 +86,9 @@ def main() -> None:
     parser = _scene.output_parser(__doc__, "mirror")
     parser.add_argument("--size", type=int, default=96, help="pixels on a side")
     options = parser.parse_args()
-    _scene.prepare_output(options.output, options.overwrite, "mirror.md", parser)
+    _scene.prepare_output(options.output, options.overwrite, "mirror", parser)
     rows = run(options.output, options.size)
-    (options.output / "mirror.md").write_text(table(rows) + "\n")
+    io.write_atomically(options.output / "mirror.md", table(rows) + "\n", overwrite=True)
     print(table(rows))
 
 

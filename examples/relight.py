@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from io import StringIO
 from pathlib import Path
 
 import _scene
@@ -155,14 +156,14 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
                 image = images[material, light, degree][part[shape]]
                 panels[material].append((show(image), error_picture(view, image, truth)))
                 name = f"{shape}_{light}_{material.split(' (')[0].replace(' ', '-')}_degree{degree:02d}.png"
-                io.write_image(output / name, np.concatenate(panels[material][-1], axis=1))
+                io.write_image(output / name, np.concatenate(panels[material][-1], axis=1), overwrite=True)
         errors = {}
         for material in brdfs:
             series = [r for r in rows if (r["material"], r["map"]) == (material, light)]
             errors[material] = [series[0][f"{shape} noise"], *(r[f"{shape} error"] for r in series)]
         contact_sheet(output / f"{shape}_{light}.png", f"{shape}, {light}", panels, degrees, errors)
         gallery.append(np.concatenate([images[-1][0] for images in panels.values()], axis=1))
-    io.write_image(output / "gallery.png", np.concatenate(gallery, axis=0))
+    io.write_image(output / "gallery.png", np.concatenate(gallery, axis=0), overwrite=True)
     return rows
 
 
@@ -203,7 +204,9 @@ def contact_sheet(path: Path, title: str, panels: dict, degrees: tuple[int, ...]
         scale.set_xticks([-3, -2, -1, 0], ["0.1 %", "1 %", "10 %", "100 %"], color=ink, fontsize=7)
         scale.tick_params(length=0, pad=1)
         figure.text(0.595, 0.2 / height, "error / mean radiance", ha="right", fontsize=8)
-        figure.savefig(path, dpi=110, facecolor=paper)
+        io.write_atomically(
+            path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper), overwrite=True
+        )
         pyplot.close(figure)
 
 
@@ -246,14 +249,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--degrees", type=int, nargs="+", default=list(DEGREES))
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
-    _scene.prepare_output(options.output, options.overwrite, "relight.csv", parser)
+    _scene.prepare_output(options.output, options.overwrite, "relight", parser)
     start = time.perf_counter()
     rows = run(options.output, options.size, options.samples, options.seed, tuple(sorted(options.degrees)))
-    with (options.output / "relight.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    (options.output / "relight.md").write_text(table(rows) + "\n")
+    text = StringIO(newline="")
+    writer = csv.DictWriter(text, rows[0])
+    writer.writeheader()
+    writer.writerows(rows)
+    io.write_atomically(options.output / "relight.csv", text.getvalue(), overwrite=True)
+    io.write_atomically(options.output / "relight.md", table(rows) + "\n", overwrite=True)
     print(table(rows))
     check(rows)
     worst = max(max(r["sphere error"], r["rabbit error"]) for r in rows if r["degree"] == max(options.degrees))

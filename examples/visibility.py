@@ -57,7 +57,7 @@ def run(output: Path, size: int, samples: int, rays: int, seed: int) -> list[dic
                 excess = np.mean((np.asarray(image, float) - np.asarray(truth.value, float)) ** 2) - noise2
                 row = {"map": name, "method": method, "error": np.sqrt(max(excess, 0) / scale)}
                 rows.append({**row, "noise": np.sqrt(noise2 / scale)})
-    io.write_image(output / "visibility.png", np.concatenate(gallery, axis=0))
+    io.write_image(output / "visibility.png", np.concatenate(gallery, axis=0), overwrite=True)
     return rows
 
 
@@ -84,9 +84,9 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=4096, help="rays at every vertex")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    _scene.prepare_output(options.output, options.overwrite, "visibility.md", parser)
+    _scene.prepare_output(options.output, options.overwrite, "visibility", parser)
     rows = run(options.output, options.size, options.samples, options.rays, options.seed)
-    (options.output / "visibility.md").write_text(table(rows) + "\n")
+    io.write_atomically(options.output / "visibility.md", table(rows) + "\n", overwrite=True)
     print(table(rows))
     check(rows)
 

@@ -388,7 +388,7 @@ def _waves(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _bin_energy() -> np.ndarray:
     """cos_i cos_o dwi dwo of each bin of a MERL table, up to a factor; zero below the horizon."""
-    wi, wo = io._merl_directions()
+    wi, wo = io.merl_directions()
     theta_h = np.pi / 2 * ((np.arange(90) + 0.5) / 90) ** 2
     theta_d = np.pi / 2 * (np.arange(90) + 0.5) / 90
     solid_angles = np.outer(np.sin(theta_h) * (np.arange(90) + 0.5), np.sin(theta_d) * np.cos(theta_d))

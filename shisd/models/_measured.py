@@ -20,6 +20,7 @@ from shisd._typing import Array, Float, Scalar, Vector
 from shisd.models._brdf import AbstractBrdf, above_horizon, parameter
 
 SHAPE = (90, 90, 180, 3)
+_NONE = 5000  # bins, more than there are
 
 
 class MeasuredBrdf(AbstractBrdf):
@@ -56,12 +57,15 @@ class MeasuredBrdf(AbstractBrdf):
         `dtype`.
 
         Bins whose centre is below the horizon have no measurement, and neither have negative or non-finite values above
-        it. `negative="fill"` gives both the nearest valid value of their channel along theta_d or phi_d, and warns with
-        the count of those above the horizon; `negative="refuse"` raises ValueError if there are any above the horizon.
-        Other errors: FileNotFoundError, and ValueError for a file that is not of this format or holds no valid value.
+        it, or ones beyond any material (`shisd.io.read_merl`, which warns). `negative="fill"` gives both the nearest
+        valid value of their channel along theta_d or phi_d, and warns with the count of those above the horizon;
+        `negative="refuse"` raises ValueError if there are any above the horizon. Other errors: FileNotFoundError, and
+        ValueError for a file that is not of this format, holds no valid value, or values that `dtype` does not hold.
         """
         if negative not in ("fill", "refuse"):
             raise ValueError(f'`negative` must be "fill" or "refuse"; got {negative!r}.')
+        if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
+            raise ValueError(f"`dtype` {np.dtype(dtype)} needs jax_enable_x64.")
         values = io.read_merl(path)
         valid = np.isfinite(values) & (values >= 0)
         missing = int(np.sum(~valid & io.merl_above_horizon()[..., None]))
@@ -73,10 +77,11 @@ class MeasuredBrdf(AbstractBrdf):
             raise ValueError(f"{os.fspath(path)}: a colour plane holds no valid value.")
         if missing:
             warnings.warn(f"{found}; filled with the nearest valid ones.", UserWarning, stacklevel=2)
-        table = jnp.asarray(filled.astype(dtype))
-        if table.dtype != np.dtype(dtype):
-            raise ValueError(f"`dtype` {np.dtype(dtype)} needs jax_enable_x64.")
-        return cls(table)
+        with np.errstate(over="ignore"):
+            filled = filled.astype(dtype)
+        if not np.isfinite(filled).all():
+            raise ValueError(f"{os.fspath(path)}: `dtype` {np.dtype(dtype)} does not hold its values; pass float32.")
+        return cls(jnp.asarray(filled))
 
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Float[Array, "3"]:
         wi, wo, above, elsewhere = above_horizon(wi, wo)
@@ -167,27 +172,26 @@ def fill_nearest(values: np.ndarray, valid: np.ndarray) -> np.ndarray | None:
         d_value, d_distance = _nearest(values, valid, 1, periodic=False)
         p_value, p_distance = _nearest(values, valid, 2, periodic=True)
         nearest = np.where(p_distance <= d_distance, p_value, d_value)
-        found = ~valid & (np.minimum(p_distance, d_distance) < np.inf)
+        found = ~valid & (np.minimum(p_distance, d_distance) < _NONE)
         values[found], valid[found] = nearest[found], True
         if valid.sum() == before:  # only empty slices are left
             h_value, h_distance = _nearest(values, valid, 0, periodic=False)
-            found = ~valid & (h_distance < np.inf)
+            found = ~valid & (h_distance < _NONE)
             values[found], valid[found] = h_value[found], True
     return values
 
 
 def _nearest(values: np.ndarray, valid: np.ndarray, axis: int, *, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest valid value along an axis, and its distance in bins: infinite where there is none."""
+    """The nearest valid value along an axis, and its distance in bins: beyond _NONE where there is none."""
     values, valid = np.moveaxis(values, axis, 0), np.moveaxis(valid, axis, 0)
     n = len(values)
     turns = 3 if periodic else 1
-    position = np.arange(turns * n).reshape(-1, *[1] * (values.ndim - 1))
-    marked = np.where(np.concatenate([valid] * turns), position, -np.inf)
-    before = np.maximum.accumulate(marked, axis=0)
-    marked[marked < 0] = np.inf
-    after = np.minimum.accumulate(marked[::-1], axis=0)[::-1]
-    nearest = np.where(position - before <= after - position, before, after)
+    position = np.arange(turns * n, dtype=np.int16).reshape(-1, *[1] * (values.ndim - 1))
+    marked = np.concatenate([valid] * turns)
+    before = np.maximum.accumulate(np.where(marked, position, np.int16(-2 * _NONE)), axis=0)
+    after = np.minimum.accumulate(np.where(marked, position, np.int16(2 * _NONE))[::-1], axis=0)[::-1]
     middle = slice(n, 2 * n) if periodic else slice(0, n)
-    nearest, distance = nearest[middle], np.abs(nearest[middle] - position[middle])
-    index = np.where(np.isfinite(nearest), nearest, 0).astype(int) % n
-    return np.moveaxis(np.take_along_axis(values, index, 0), 0, axis), np.moveaxis(distance, 0, axis)
+    position, before, after = position[middle], before[middle], after[middle]
+    nearest = np.where(position - before <= after - position, before, after)
+    found = np.take_along_axis(values, (nearest % n).astype(np.intp), 0)
+    return np.moveaxis(found, 0, axis), np.moveaxis(np.abs(nearest - position), 0, axis)

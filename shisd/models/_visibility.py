@@ -122,21 +122,21 @@ class Visibility(eqx.Module):
         return cls(c, corners, noise)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write all fields as an .npz file. FileExistsError unless `overwrite=True`."""
-        path = _npz(path)
-        if path.exists() and not overwrite:
-            raise FileExistsError(f"{path} exists; pass overwrite=True to replace it.")
-        np.savez_compressed(path, coefficients=self.coefficients, triangles=self.triangles, noise=self.noise)
+        """Write all fields as an .npz file, which is there completely or not at all (`shisd.io.write_atomically`).
+
+        Errors: FileExistsError unless `overwrite=True`; ValueError for another suffix than .npz.
+        """
+        write = lambda file: np.savez_compressed(
+            file, coefficients=self.coefficients, triangles=self.triangles, noise=self.noise
+        )
+        io.write_atomically(_npz(path), write, overwrite=overwrite)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Visibility":
         """What `save` wrote. FileNotFoundError, or ValueError for a file that holds something else."""
-        path = _npz(path)
-        if not path.exists():
-            raise FileNotFoundError(f"{path}: no such file.")
+        path = io.ordinary(_npz(path))
         try:
-            with np.load(path) as file:
-                return cls(*(file[name] for name in ("coefficients", "triangles", "noise")))
+            return cls(*io.read_npz(path, ("coefficients", "triangles", "noise")))
         except Exception as error:
             raise ValueError(f"{path}: not a file that Visibility.save wrote: {error}") from error
 

@@ -11,7 +11,7 @@ import optimistix as optx
 from numpy.polynomial import legendre as series
 from scipy.optimize import linprog
 
-from shisd import decomposition, harmonics, models
+from shisd import decomposition, harmonics, io, models
 from shisd._numerics import normalize
 from tests.bench.make_directions import band_matrix, worst_condition
 from tests.truth import scipy_basis
@@ -189,7 +189,7 @@ def kernels_figure(rows, path):
     panels[0].text(4, 7e15, "1/eps, float64", fontsize=7, color="grey", va="bottom")
     panels[-1].legend(fontsize=7, loc="upper left")
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
     pyplot.close(figure)
 
 

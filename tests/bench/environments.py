@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, models, reference, shading
+from shisd import decomposition, harmonics, io, models, reference, shading
 from tests.bench import lobes, monte_carlo, sh_rotation, split_sum
 from tests.bench.harness import Method, Task
 from tests.bench.timing import timed
@@ -310,7 +310,7 @@ def make_fits():
             table, seconds = timed(lambda brdf=brdf, count=count: lobes.fit_table(brdf, count), kind)
             arrays |= {f"{name}: {part}": getattr(table, part) for part in PARTS} | {f"{name}: seconds": seconds}
             print(f"{name} Gaussians: {seconds:.2f} s", flush=True)
-    np.savez_compressed(FITTED, **arrays)
+    io.write_atomically(FITTED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
 
 
 def shade_gaussians(parameters, normals, views):
@@ -365,7 +365,7 @@ def make_references():
             error = np.sqrt(np.mean((values[:16] - finer) ** 2) / np.mean(finer**2))
             arrays[f"{material}, {name}"], arrays[f"{material}, {name}: error"] = values, error
             print(f"{material}, {name}: RMS {np.sqrt(np.mean(values**2)):.4g}, error {error:.1e}", flush=True)
-    np.savez_compressed(STORED, **arrays)
+    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
 
 
 if __name__ == "__main__":

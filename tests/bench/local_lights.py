@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, models, reference, shading
+from shisd import decomposition, harmonics, io, models, reference, shading
 from tests.bench import area_lights, lobes, polygons
 from tests.bench.harness import Method, Task, run
 from tests.truth import scipy_basis, triangle_rule
@@ -326,7 +326,7 @@ def make() -> None:
 
     add("projection", coefficients(24), coefficients(18))
     FILE.parent.mkdir(exist_ok=True)
-    np.savez_compressed(FILE, **stored)
+    io.write_atomically(FILE, lambda file: np.savez_compressed(file, **stored), overwrite=True)
 
 
 def main() -> None:

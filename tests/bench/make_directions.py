@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from scipy.special import sph_harm_y
 
-from shisd import decomposition
+from shisd import decomposition, io
 
 OUTPUT = Path(decomposition.__file__).parent / "data" / "optimized_directions.npz"
 TOP = 64
@@ -99,7 +99,9 @@ def main() -> None:
         print(f"{degree:3d}  {condition:8.4f}  (before: {conditions[degree]:.4f})  {seconds:6.1f} s", flush=True)
         if condition < conditions[degree]:
             table[rows], conditions[degree], nested[degree] = z, condition, worst_condition(z, degree, nested=True)
-        np.savez_compressed(options.output, directions=table, conditions=conditions, nested_conditions=nested)
+        found = {"directions": table, "conditions": conditions, "nested_conditions": nested}
+        write = lambda file, found=found: np.savez_compressed(file, **found)
+        io.write_atomically(options.output, write, overwrite=True)
         jax.clear_caches()
 
 

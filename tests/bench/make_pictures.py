@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from shisd import harmonics, models
+from shisd import harmonics, io, models
 
 DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 SEED = 20150801
@@ -139,7 +139,10 @@ def main() -> None:
             "mitsuba": mitsuba.__version__,
         }
         held = {"picture": picture.astype(np.float32), **CAMERA, **known, **made}
-        np.savez_compressed(path, **held, **{f"truth_{key}": value for key, value in truth.items()})
+        held |= {f"truth_{key}": value for key, value in truth.items()}
+        io.write_atomically(
+            path, lambda file, held=held: np.savez_compressed(file, **held), overwrite=options.overwrite
+        )
         print(f"{path}: noise {100 * noise:.2g} %, {path.stat().st_size} bytes, {time.perf_counter() - start:.0f} s")
 
 

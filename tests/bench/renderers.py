@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from shisd import decomposition, models, shading
+from shisd import decomposition, io, models, shading
 from tests.bench import make_pictures
 from tests.bench.harness import Method, Task
 
@@ -295,7 +295,7 @@ def main() -> None:
         stored |= {name: mean.astype(np.float32), f"{name} noise": noise}
         print(f"{name}: {len(mean)} pixels, {PASSES * PASS_SAMPLES} samples each, noise {noise:.2g}", flush=True)
     STORED.parent.mkdir(exist_ok=True)
-    np.savez_compressed(STORED, **stored)
+    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
     print(f"{STORED.name}: {STORED.stat().st_size} bytes")
 
 

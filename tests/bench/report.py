@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from shisd import io
 from tests.bench import applications, environments, harness, local_lights, renderers, roofline, spherical
 from tests.bench.run import paste, table
 
@@ -117,12 +118,13 @@ def main() -> None:
             short = f"{applications.NOTE}\n\n{table(applications.summary(made))}" if name in APART else text
             keep(name, f"{short}\n\n{note}", text)
     report = "\n\n".join(["# Speed against error", note, *(long for _, long in sections.values())]) + "\n"
-    (arguments.output / "report.json").write_text(json.dumps(results, indent=1))
+    io.write_atomically(arguments.output / "report.json", json.dumps(results, indent=1), overwrite=True)
     for folder in folders[:1] if arguments.only else folders:  # a part does not replace the whole
-        (folder / "report.md").write_text(report)
+        io.write_atomically(folder / "report.md", report, overwrite=True)
     for name, (short, long) in sections.items() if arguments.readme else ():
         if name in APART:
-            Path(f"examples/{name}.md").write_text(f"# {name.capitalize()}\n\n{note}\n\n{long}\n")
+            text = f"# {name.capitalize()}\n\n{note}\n\n{long}\n"
+            io.write_atomically(f"examples/{name}.md", text, overwrite=True)
         if f"<!-- table:{name} -->" in Path("README.md").read_text():
             paste(name, short)
     print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")

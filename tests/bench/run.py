@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, domains, models, reference, shading
+from shisd import decomposition, domains, io, models, reference, shading
 from shisd.domains import _moments
 from shisd.harmonics import _tables
 from tests.bench import conditioning, equation_22, lobes, native, planning, polygons, stability
@@ -243,7 +243,7 @@ def cost_figure(rows, path):
     axes.set(xlabel="coefficients $(L+1)^2$", ylabel="us per triangle", title="Cost of one integral over a triangle")
     axes.legend()
     figure.tight_layout()
-    figure.savefig(path, dpi=120)
+    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=120), overwrite=True)
     pyplot.close(figure)
 
 
@@ -297,7 +297,8 @@ def paste(name, text):
     """Put a text between the README's markers of a name."""
     readme, start = Path("README.md"), f"<!-- table:{name} -->"
     before, rest = readme.read_text().split(start)
-    readme.write_text(f"{before}{start}\n{text}\n<!-- /table -->{rest.split('<!-- /table -->', 1)[1]}")
+    rest = rest.split("<!-- /table -->", 1)[1]
+    io.write_atomically(readme, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
 
 
 def main():
@@ -327,8 +328,8 @@ def main():
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
-    (arguments.output / "bench.json").write_text(json.dumps(results, indent=1))
-    (arguments.output / "bench.md").write_text("\n\n".join([*sections.values(), note]) + "\n")
+    io.write_atomically(arguments.output / "bench.json", json.dumps(results, indent=1), overwrite=True)
+    io.write_atomically(arguments.output / "bench.md", "\n\n".join([*sections.values(), note]) + "\n", overwrite=True)
     for marker, names in README.items() if arguments.readme else ():
         if all(name in sections for name in names):
             paste(marker, "\n\n".join([*(sections[name] for name in names), note]))

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y_all
 
-from shisd import harmonics
+from shisd import harmonics, io
 from shisd.harmonics._rotation import rotate_many
 from tests.bench.harness import Method, Task
 from tests.truth import scipy_basis
@@ -738,7 +738,7 @@ def main() -> None:
             stored[f"{name}_{degree}_error"] = difference(finer, values)
             print(f"{name}, degree {degree}: error {stored[f'{name}_{degree}_error']:.1e}", flush=True)
     STORED.parent.mkdir(exist_ok=True)
-    np.savez_compressed(STORED, **stored)
+    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
     print(f"{STORED.name}: {STORED.stat().st_size} bytes")
 
 
