@@ -4,8 +4,11 @@ Shapes, types and static arguments are known while tracing, so these checks cost
 """
 
 import math
+import numbers
 import operator
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -14,12 +17,16 @@ from shisd._typing import Array
 
 
 def real_array(name: str, value: ArrayLike) -> Array:
-    """`value` as a floating JAX array: float32 and float64 stay, integers become floats."""
+    """`value` as a floating JAX array: float32 and float64 in either byte order stay, integers become floats."""
+    if isinstance(value, np.ndarray | np.generic):
+        if value.dtype.kind == "f" and value.dtype.itemsize > 8:
+            raise ValueError(f"`{name}` must hold real numbers; got dtype {value.dtype}. Pass float32 or float64.")
+        value = value.astype(value.dtype.newbyteorder("="), copy=False)
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"`{name}` must be an array of real numbers; got {type(value).__name__}.") from error
-    if jnp.issubdtype(array.dtype, jnp.floating):
+    if array.dtype in (jnp.float32, jnp.float64):
         return array
     if jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.bool_):
         return array.astype(float)
@@ -88,11 +95,24 @@ def integer(name: str, value: object, minimum: int = 0) -> int:
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except Exception as error:  # a tracer raises JAX's own error type
-        message = f"`{name}` must be a Python integer known while tracing; got {type(value).__name__}."
-        raise ValueError(message) from error
+        known = " known while tracing" if isinstance(value, jax.core.Tracer) else ""
+        came = repr(value) if isinstance(value, numbers.Number | str) else type(value).__name__
+        raise ValueError(f"`{name}` must be a Python integer{known}; got {came}.") from error
     if number < minimum:
         raise ValueError(f"`{name}` must be >= {minimum}; got {number}.")
     return number
+
+
+def require(value: Array, good: ArrayLike, message: str) -> Array:
+    """`value`, where all of `good` is true. Where it is not, a ValueError at once, or under jit an error at run time.
+
+    What is known is judged here and not by `eqx.error_if`, whose message stands among twenty lines of others.
+    """
+    if isinstance(good, jax.core.Tracer):
+        return eqx.error_if(value, ~jnp.all(good), message)
+    if not np.all(good):
+        raise ValueError(message)
+    return value
 
 
 def degree(value: object) -> int:

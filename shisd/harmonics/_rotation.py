@@ -9,8 +9,8 @@ notation: R = Rz(a) Ry(b) Rz(g); c = coefficients; J_l = `_tables.swap_matrices`
 """
 
 import functools
+import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,8 +26,8 @@ from shisd.harmonics import _tables
 def rotate(coefficients: ArrayLike, rotation: ArrayLike) -> Float[Array, "*batch n"]:
     """Coefficients of the rotated expansion (R f)(w) = f(R^T w).
 
-    Arguments: `coefficients` [..., (L+1)^2]; `rotation` [3, 3], orthonormal with determinant +1 (a matrix that is not,
-    by more than 1e-3, raises; batch it with jax.vmap).
+    Arguments: `coefficients` [..., (L+1)^2]; `rotation` [3, 3], orthonormal with determinant +1 (batch it with
+    jax.vmap). A matrix that is not, by more than 1e-3, raises; of one that is nearer, the nearest rotation is taken.
     Derivatives: in both arguments, every order, both modes, exact at the identity and wherever the pole stays in place.
     In `rotation` they are taken along the group of rotations: the part of a tangent that leaves it has no effect.
     Accuracy: 1e-12 at degree 100 in float64, 1e-5 in float32, relative to the largest coefficient of the band.
@@ -37,18 +37,22 @@ def rotate(coefficients: ArrayLike, rotation: ArrayLike) -> Float[Array, "*batch
     c, degree = _checks.coefficients("coefficients", coefficients)
     r = _checks.matrix("rotation", rotation)
     dtype = jnp.promote_types(c.dtype, r.dtype)
-    return _rotate(c.astype(dtype), r.astype(dtype), degree)
+    c, r = c.astype(dtype), r.astype(dtype)
+    message = "`rotation` must be orthonormal with determinant +1 (R^T R = 1, right-handed)."
+    return _rotate(c, _checks.require(r, _is_rotation(r), message), degree)
 
 
-@eqx.filter_jit
-def _rotate(c: Float[Array, "*batch n"], r: Float[Array, "3 3"], degree: int) -> Float[Array, "*batch n"]:
+@jax.jit
+def _is_rotation(r: Float[Array, "3 3"]) -> Array:
     drift = jnp.abs(r.T @ r - jnp.eye(3, dtype=r.dtype))
-    handed = jnp.dot(jnp.cross(r[:, 0], r[:, 1]), r[:, 2])
-    bad = ~(jnp.all(drift < 1e-3) & (handed > 0))
-    r = eqx.error_if(r, bad, "`rotation` must be orthonormal with determinant +1 (R^T R = 1, right-handed).")
-    flat = c.reshape(-1, c.shape[-1])
-    if flat.shape[0] > 8:  # then not the series in the first angle, which pays where many rotations share an expansion
-        flat = flat.T[..., None]
+    return jnp.all(drift < 1e-3) & (jnp.dot(jnp.cross(r[:, 0], r[:, 1]), r[:, 2]) > 0)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _rotate(c: Float[Array, "*batch n"], r: Float[Array, "3 3"], degree: int) -> Float[Array, "*batch n"]:
+    for _ in range(3):  # to the nearest rotation: drifts of 1e-3, 1e-6, 1e-12 (Newton's method, Higham 1986)
+        r = 1.5 * r - 0.5 * r @ (r.T @ r)
+    flat = c.reshape(math.prod(c.shape[:-1]), c.shape[-1]).T[..., None]
     return rotate_many(flat, r[None], degree)[..., 0].T.reshape(c.shape)
 
 
@@ -108,7 +112,8 @@ def _rotate_many_away_from_pole(c: Array, r: Float[Array, "p 3 3"], degree: int)
 
 def turns(r: Float[Array, "p 3 3"], degree: int) -> list[list[Array]]:
     """Cosines and sines [L+1, p] of the multiples of the three angles of each rotation."""
-    return [list(angle_multiples(cos, sin, degree + 1)) for cos, sin in _angles(r)]
+    cos, sin = angle_multiples(*(jnp.stack(parts) for parts in zip(*_angles(r), strict=True)), degree + 1)
+    return [[cos[:, i], sin[:, i]] for i in range(3)]
 
 
 def _finish(x: Float[Array, "n f p"], a: list[Array] | None, b: list[Array], degree: int) -> Float[Array, "n f p"]:
@@ -137,11 +142,27 @@ def _turn(x: Float[Array, "n f p"], cos: Array, sin: Array, degree: int) -> Floa
 
 def swap(x: Float[Array, "n f p"], degree: int) -> Float[Array, "n f p"]:
     """y and z exchanged: J_l on every band."""
-    bands = [
-        jnp.tensordot(jnp.asarray(j, x.dtype), x[l * l : (l + 1) ** 2], 1)
-        for l, j in enumerate(_tables.swap_matrices(degree))
-    ]
-    return jnp.concatenate(bands)
+    groups, place = _swap_groups(degree)
+    bands = [jnp.einsum("lij,ljfp->lifp", jnp.asarray(j, x.dtype), x[index]) for index, j in groups]
+    return jnp.concatenate([b.reshape(b.shape[0] * b.shape[1], *x.shape[1:]) for b in bands])[place]
+
+
+@functools.cache
+def _swap_groups(degree: int) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    """J_l of eight bands together, filled up to the size of the last: one product for each band is slow to compile.
+
+    For each group the coefficients [l, 2l+1] that it takes, where the filling repeats those of the band, and matrices;
+    and where each coefficient then is.
+    """
+    groups, place, start, swaps = [], [], 0, _tables.swap_matrices(degree)
+    for first in range(0, degree + 1, 8):
+        l = np.arange(first, min(first + 8, degree + 1))[:, None]
+        m = np.arange(2 * l[-1, 0] + 1)
+        matrices = np.stack([np.pad(swaps[k], (0, m.size - 2 * k - 1)) for k in l[:, 0]])
+        groups.append(((l * l + np.minimum(m, 2 * l)).astype(np.int32), matrices))
+        place.append(np.flatnonzero(m <= 2 * l) + start)
+        start += l.size * m.size
+    return groups, np.concatenate(place).astype(np.int32)
 
 
 def _swap_turned(c: Array, cos: Array, sin: Array, degree: int) -> Float[Array, "n f p"]:
