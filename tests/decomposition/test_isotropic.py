@@ -268,7 +268,7 @@ def test_bad_shapes_are_refused(as_user):
         (lambda: IsotropicBasis(kernel, z[:2], 2), r"\[degree \+ 1, K, 3\] = \[3, K, 3\].*got \[2, 5, 3\]"),
         (lambda: IsotropicBasis(kernel, z[:, :4], 2), r"at least 2\*degree \+ 1 = 5 axes for degree 2; got 4"),
         (lambda: basis.weights(np.ones(4)), "`coefficients` must be of the basis' degree 2"),
-        (lambda: basis.weights(np.ones(9), ridge=-1.0), "`ridge` must be a Python number >= 0; got -1.0"),
+        (lambda: basis.weights(np.ones(9), ridge=-1.0), "`ridge` must be finite and >= 0; got -1.0"),
         (lambda: basis.coefficients(np.ones((3, 4))), r"`weights` must have shape .*\[..., 3, 5\]; got \[3, 4\]"),
         (lambda: basis.filter(np.ones((3, 5)), np.ones(9), np.ones((2, 3))), r"`rotations` must have shape"),
         (lambda: basis.filter(np.ones((2, 3, 5)), np.ones(9), np.ones((4, 3, 3))), "do not broadcast"),
