@@ -351,8 +351,10 @@ def plan(
     Where nothing meets the tolerance, the entry has the best that `max_degree` can do and `met` False, and a
     UserWarning says so; `throw=True` raises ValueError instead. `progress`: None, True for a bar of tqdm, or a function
     of (done, total) lights and materials.
-    Accuracy: predictions are for bands up to max(32, 2 max_degree); for most materials they are within a factor of 2 of
-    what quadrature measures (tests/bench/planning.py). Materials and lights in float32 show nothing below 1e-5.
+    Accuracy: predictions are for bands up to max(32, 2 max_degree). Over all orientations, what six photographed maps
+    gave for three materials at degrees 2 to 12 was 0.65 to 1.06 times the prediction, of the worst colour. One picture
+    does not show all orientations: there it was 0.2 to 4.2 times, four of five between 0.35 and 1.85, more for cameras
+    that see the sides with the edges of the light. Materials and lights in float32 show nothing below 1e-5.
     Not traced: it runs on the host and returns what is to be traced.
     Cost: every material is tabulated once, which compiles for each kind of material.
     """

@@ -167,8 +167,8 @@ class PhongKernel(AbstractKernel):
     def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
         x = _checks.real_array("x", x)
         a = self._exponents(_checks.integer("level", level), x.dtype)[-1]
-        below = x <= 0  # NaN is not, and stays
-        return jnp.where((a == 0) & ~jnp.isnan(x), 1, jnp.where(below, 0, jnp.where(below, 1, x) ** a))
+        above = jnp.where(x > 0, jnp.where(x > 0, x, 1) ** a, 0)
+        return jnp.where(jnp.isnan(x), x, jnp.where(a == 0, 1, above))
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)

@@ -191,8 +191,8 @@ def tabulate_brdf(
     `Lobes.quadrature_error` is above `tolerance`. If no rule, or the one given, is enough, it is a ValueError;
     `throw=False` leaves that to the caller. While JAX traces, as under jit and grad, nothing can be chosen: 32 + degree
     nodes are taken unless `quadrature` says otherwise, and it is an error at run time where they are not enough. The
-    error is the RMS over the views of a sphere's picture of what the last quarter of the nodes changes in the slices,
-    relative to that of the slices, times what it is less than the change from the quarter before, of the worst colour.
+    error is estimated from what the last quarter of the nodes changes in the slices, a, and the quarter before, b: as
+    2 a min(1, a / b), of the worst colour, a and b RMS over the views of a sphere's picture relative to the slices.
     `domain` "upper" fits the slices above the horizon only, for integrals over lights that are cut off there
     (`shade_polygon`): the kink of the cosine is no longer expanded, and errors are up to 100 times smaller. `ridge`
     limits what the fit may do below the horizon: rounding grows like 1/sqrt(ridge), measured 1e-5 in float32 at the
@@ -200,7 +200,10 @@ def tabulate_brdf(
     that is tried; not while JAX traces. The result has the dtype of the basis.
     Derivatives: in every parameter of the material and in the lobe directions, both modes. The nodes follow
     `brdf.lobe_width`, through which no derivative passes.
-    Accuracy: TODO
+    Accuracy: `quadrature_error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's format
+    at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in float32,
+    2e-7 for GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1; 4e-4 or
+    less for tables in MERL's format at degree 16.
     Cost: 1.8 views x quadrature^2 evaluations of the material; one view's harmonics are in memory at a time.
     """
     if not isinstance(brdf, AbstractBrdf):
@@ -327,7 +330,7 @@ def _as_table(
     before, after, whole = jnp.tensordot(shares, changes.reshape(len(shares), -1, *changes.shape[1:]).sum(axis=1), 1)
     ratio = lambda a, b: jnp.where(a < b, a / jnp.where(a < b, b, 1), 1)  # at most 1; NaN of NaN
     square = after / jnp.where(whole > 0, whole, 1) * ratio(after, before)
-    error = safe_sqrt(jnp.max(square))
+    error = jnp.maximum(2 * safe_sqrt(jnp.max(square)), 8 * float(jnp.finfo(c.dtype).eps))  # at least the rounding
     c = jnp.moveaxis(c.reshape(*views, *c.shape[1:]), range(len(views)), range(-1 - len(views), -1))  # colour first
     return (c if ridge is None else fit_above(c, ridge)), error
 

@@ -78,7 +78,7 @@ def prefilter(
     Channels are chosen from values, so not under jit, grad or vmap. There pass `like`, an earlier result: its channels
     are used again and only the tables are made, a pure function of `lobes` and `light_coefficients`, linear in each.
     `error` is then that of its channels for this material and this light, and nothing holds it below `tolerance`:
-    channels chosen at alpha 0.25 and a tolerance of 1e-2 leave LIKE_NUMBERS.
+    channels chosen for GGX of alpha 0.4 at 1e-2 leave 2.3e-2 at alpha 0.3 and 0.15 at 0.8, at degree 6.
     Derivatives: with `like`, in both; those of channels that stay as they are. So a fit of the light is as good as its
     values, but the slope in a material's roughness lacks what would need other channels, and a fit by it may end beside
     the best one: fit materials by `shade_environment`, whose derivatives are exact, and filter what was found. Read
