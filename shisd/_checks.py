@@ -124,3 +124,14 @@ def require(value: Array, good: ArrayLike, message: str) -> Array:
 def degree(value: object) -> int:
     """The static argument `degree`, the highest band L, inclusive."""
     return integer("degree", value)
+
+
+def number(name: str, value: object, *, positive: bool = False) -> float:
+    """`value` as a static Python number, finite and not negative, or above 0 if `positive`."""
+    try:
+        found = float(value)  # type: ignore[arg-type]
+    except Exception as error:  # a tracer raises JAX's own error type
+        raise ValueError(f"`{name}` must be a number known while tracing; got {type(value).__name__}.") from error
+    if not (math.isfinite(found) and (found > 0 if positive else found >= 0)):
+        raise ValueError(f"`{name}` must be finite and {'>' if positive else '>='} 0; got {found}.")
+    return found

@@ -80,9 +80,9 @@ def rows_of(x: Float[Array, " p"], factors: np.ndarray) -> Float[Array, "n p"]:
 
 
 def safe_sqrt(x: Array) -> Array:
-    """Square roots whose derivative at 0 is 0, not infinite."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+    """Square roots whose derivative at 0 is 0, not infinite. Of less than 0: 0, as of rounding; of NaN: NaN."""
+    nothing = x <= 0
+    return jnp.where(nothing, 0, jnp.sqrt(jnp.where(nothing, 1, x)))
 
 
 @jax.custom_jvp

@@ -294,8 +294,8 @@ def denoise_merl(
     table = np.asarray(source, np.float64) if isinstance(source, np.ndarray) else io.read_merl(source)
     if table.shape != (*io.MERL_BINS, 3):
         raise ValueError(f"`source` must be a path or a table [90, 90, 180, 3]; got shape {list(table.shape)}.")
-    if smoothness is not None and not smoothness > 0:
-        raise ValueError(f"`smoothness` must be > 0; got {smoothness}.")
+    if smoothness is not None:
+        smoothness = _checks.number("smoothness", smoothness, positive=True)
     above = io.merl_above_horizon()[..., None]
     valid = np.isfinite(table) & (table >= 0) & above
     table = np.where(valid, table, 0)

@@ -15,6 +15,7 @@ notation: rho_l = slice; e_l = distant light; p_l = a local light, as a point se
 import abc
 import functools
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -25,6 +26,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._progress import Progress, reporting
 from shisd._typing import Array, Float
 from shisd.decomposition import RotatedZonalBasis, optimized_directions
 from shisd.decomposition._directions import TABLE_DEGREE
@@ -44,6 +46,7 @@ from shisd.shading._polygon import incident_radiance
 
 Light = Environment | PolygonLight | PortalLight | ArrayLike
 _ELEVATIONS = 12  # of the views whose slices are judged: Gauss nodes
+_DARK = 1e-6  # of the brightest colour's radiance: a colour below it is rounding
 _AZIMUTHS = 6  # of these views, for anisotropic materials
 
 
@@ -81,7 +84,9 @@ class Scene(eqx.Module):
 
 
 class Entry(NamedTuple):
-    """The decision for one material and one light. Errors are relative to the RMS radiance of this pair."""
+    """The decision for one material and one light. Errors are relative to the RMS radiance of this pair, of the colour
+    for which they are largest.
+    """
 
     material: str
     light: str
@@ -333,19 +338,23 @@ def plan(
     margin: float = 1.5,
     views: int = 64,
     throw: bool = False,
+    progress: Progress = None,
 ) -> Plan:
     """For each material and light of a scene, the cheapest path and the smallest degree that meet a tolerance.
 
     Arguments: `tolerance` > 0, the relative RMS error: of the radiance from one light, over its RMS, both over normals
-    in all directions and views as in the picture of a sphere. Static `max_degree` up to 64; `margin` >= 1, by which
-    predictions are multiplied before they are compared: real scenes are not turned in all ways. `views`: elevations of
-    the tables, as in `shading.tabulate_brdf`.
+    in all directions and views as in the picture of a sphere; every colour has to meet it. Static `max_degree` up to
+    64; `margin` >= 1, by which predictions are multiplied before they are compared: real scenes are not turned in all
+    ways. `views`: elevations of the tables, as in `shading.tabulate_brdf`.
     Distant lights that take the same path are added up before it, so only the first of them costs anything, and others
     join where they meet the tolerance there.
     Where nothing meets the tolerance, the entry has the best that `max_degree` can do and `met` False, and a
-    UserWarning says so; `throw=True` raises ValueError instead.
-    Accuracy: predictions are for bands up to max(32, 2 max_degree); for most materials they are within a factor of 2 of
-    what quadrature measures (tests/bench/planning.py). Materials and lights in float32 show nothing below 1e-5.
+    UserWarning says so; `throw=True` raises ValueError instead. `progress`: None, True for a bar of tqdm, or a function
+    of (done, total) lights and materials.
+    Accuracy: predictions are for bands up to max(32, 2 max_degree). Over all orientations, what six photographed maps
+    gave for three materials at degrees 2 to 12 was 0.65 to 1.06 times the prediction, of the worst colour. One picture
+    does not show all orientations: there it was 0.2 to 4.2 times, four of five between 0.35 and 1.85, more for cameras
+    that see the sides with the edges of the light. Materials and lights in float32 show nothing below 1e-5.
     Not traced: it runs on the host and returns what is to be traced.
     Cost: every material is tabulated once, which compiles for each kind of material.
     """
@@ -354,13 +363,31 @@ def plan(
     max_degree, views = _checks.integer("max_degree", max_degree), _checks.integer("views", views, 4)
     if max_degree > TABLE_DEGREE:
         raise ValueError(f"`max_degree` must be <= {TABLE_DEGREE}; got {max_degree}.")
-    tolerance = float(tolerance)
-    if not tolerance > 0:
-        raise ValueError(f"`tolerance` must be > 0; got {tolerance}.")
-    if not margin >= 1:
+    tolerance, margin = _checks.number("tolerance", tolerance, positive=True), _checks.number("margin", margin)
+    if margin < 1:
         raise ValueError(f"`margin` must be >= 1; got {margin}.")
+    with reporting(progress, len(scene.lights) + len(scene.materials), "plan") as step:
+        made = _plan(scene, tolerance, margin, max_degree, views, step)
+    if not made.met:
+        failed = [f"{e.material} under {e.light} ({100 * e.error:.2g} %)" for e in made.entries if not e.met]
+        message = (
+            f"`tolerance` {tolerance} with `margin` {margin} is not met at degree {max_degree}: {', '.join(failed)}. "
+            "Raise `max_degree` or `tolerance`."
+        )
+        if throw:
+            raise ValueError(message)
+        warnings.warn(message, UserWarning, stacklevel=2)
+    return made
+
+
+def _plan(
+    scene: Scene, tolerance: float, margin: float, max_degree: int, views: int, step: Callable[..., object]
+) -> Plan:
     reference = max(32, 2 * max_degree)
-    lights = {name: _seen(name, light, scene.points, reference) for name, light in scene.lights.items()}
+    lights = {}
+    for name, light in scene.lights.items():
+        lights[name] = _seen(name, light, scene.points, reference)
+        step()
     entries, paths = [], {}
     for name, brdf in scene.materials.items():
         material = _material(brdf, reference, views)
@@ -379,17 +406,8 @@ def plan(
             for host, choice in choices.items()
             if hosts[host] == host
         )
-    made = Plan(tuple(entries), tolerance, paths)
-    if not made.met:
-        failed = [f"{e.material} under {e.light} ({100 * e.error:.2g} %)" for e in entries if not e.met]
-        message = (
-            f"`tolerance` {tolerance} with `margin` {margin} is not met at degree {max_degree}: {', '.join(failed)}. "
-            "Raise `max_degree` or `tolerance`."
-        )
-        if throw:
-            raise ValueError(message)
-        warnings.warn(message, UserWarning, stacklevel=2)
-    return made
+        step()
+    return Plan(tuple(entries), tolerance, paths)
 
 
 # ---- What is known of a material and a light
@@ -571,20 +589,21 @@ class _Choice(NamedTuple):
 def _judge(path: type[Path], material: _Material, light: _Seen, degree: int) -> _Choice:
     error, bound = predict(*path.left_out(material, light, degree), material.shares)
     radiance = predict(material.norms, light.norms, material.shares)[0]
-    scale = 1 / radiance if radiance > 0 else 0.0
-    return _Choice(path, degree, error * scale, bound * scale, path.cost(material, light, degree))
+    dark = radiance <= _DARK * np.max(radiance)
+    relative = lambda x: float(np.max(np.where(dark, 0, x / np.where(dark, 1, radiance))))
+    return _Choice(path, degree, relative(error), relative(bound), path.cost(material, light, degree))
 
 
-def predict(slices: np.ndarray, lights: np.ndarray, shares: np.ndarray) -> tuple[float, float]:
+def predict(slices: np.ndarray, lights: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """RMS of the product of slices and lights, and a bound on it, from norms of their bands [C, V, l] and [C, P, l].
 
-    The RMS is over views by their `shares` [V], points, colours, and all rotations between slices and lights; the bound
-    holds for the worst of the rotations.
+    One for each colour [C]. The RMS is over views by their `shares` [V], points, and all rotations between slices and
+    lights; the bound holds for the worst of the rotations.
     """
     energy = np.einsum("v,cvl->cl", shares, slices**2) * np.mean(lights**2, axis=1)
     worst = slices @ np.swapaxes(lights, 1, 2)  # [C, V, P]
-    square = np.mean(np.sum(energy / (2 * np.arange(slices.shape[-1]) + 1), axis=-1))
-    return float(np.sqrt(square)), float(np.sqrt(np.mean(np.einsum("v,cvp->cp", shares, worst**2))))
+    square = np.sum(energy / (2 * np.arange(slices.shape[-1]) + 1), axis=-1)
+    return np.sqrt(square), np.sqrt(np.mean(np.einsum("v,cvp->cp", shares, worst**2), axis=1))
 
 
 def _choose(material: _Material, light: _Seen, target: float, max_degree: int) -> _Choice:

@@ -112,14 +112,16 @@ def conditioning_loss(
     is the mean eigenvalue times the mean inverse, the frame potential of least squares.
 
     Arguments: `directions` [K, 3], nonzero, taken as unit vectors along them; static `degree` L, with K >= 2L+1;
-    `power` > 0; static `nested`: band l has only the first 2l+1 axes; static `bands`: those that count, by default
-    0 ... L (for axes that serve band l alone, bands=(l,)).
+    `power` > 0 and finite, else the loss is NaN; static `nested`: band l has only the first 2l+1 axes; static `bands`:
+    those that count, by default 0 ... L (for axes that serve band l alone, bands=(l,)).
     Derivatives: in directions, first order, both modes, also where eigenvalues meet, because the sums are symmetric in
     them. Infinite or NaN for singular sets.
     """
     z, degree = _checks.vectors("directions", directions), _checks.degree(degree)
     check_count(z, degree)
-    return _loss(normalize(z), jnp.asarray(power, dtype=z.dtype), degree, bool(nested), _bands(bands, degree))
+    power = jnp.asarray(power, dtype=z.dtype)
+    power = jnp.where((power > 0) & (power < jnp.inf), power, jnp.nan)
+    return _loss(normalize(z), power, degree, bool(nested), _bands(bands, degree))
 
 
 def optimize_directions(
@@ -156,6 +158,9 @@ def optimize_directions(
     if mirror is not None and starts.shape[-2] % 2 == 0:
         raise ValueError(f"`mirror` needs an odd number of axes: one in the plane, and pairs; got {starts.shape[-2]}.")
     steps, plane = _checks.integer("max_steps", max_steps, 1), None if mirror is None else "xyz".index(mirror)
+    powers = tuple(_checks.number("powers", power, positive=True) for power in powers)
+    if not powers:
+        raise ValueError("`powers` must hold at least one power.")
     starts = normalize(starts if several else starts[None])
     return _minimise(
         starts, jnp.asarray(powers, dtype=starts.dtype), degree, steps, bool(nested), _bands(bands, degree), plane
@@ -198,6 +203,7 @@ def _mirrored(free: Float[Array, "h 3"], plane: int) -> Float[Array, "k 3"]:
     return jnp.concatenate([first, pairs])
 
 
+@eqx.filter_jit
 def _loss(z: Float[Array, "K 3"], power: Scalar, degree: int, nested: bool, bands: tuple[int, ...]) -> Scalar:
     size, counts = z.shape[0], 2 * np.asarray(bands)[:, None] + 1
     # Legendre polynomials at cosines that rounding left above 1 are harmless: the recurrence is a polynomial.

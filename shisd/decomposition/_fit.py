@@ -78,8 +78,7 @@ def fit_lobes(
     in float64 and 4e-6, 3e-4 and 1e-3 rad in float32.
     Cost: steps x N x (columns)^2; `make bench` reports the time.
     """
-    if not ridge >= 0:
-        raise ValueError(f"`ridge` must be >= 0; got {ridge}.")
+    ridge = _checks.number("ridge", ridge)
     starts = [start] if isinstance(start, AbstractLobes) else list(start)
     _check_starts(starts)
     w, y, areas = _samples(directions, values, solid_angles)
@@ -91,7 +90,8 @@ def fit_lobes(
     eps = float(jnp.finfo(w.dtype).eps)
     penalty = jnp.asarray(max(ridge, 8 * starts[0].linear.shape[-1] * eps), w.dtype)
     max_steps = _checks.integer("max_steps", max_steps, 1)
-    return _fit(stacked, w, y, areas, penalty, max_steps, eps**0.5 if tolerance is None else float(tolerance))
+    tolerance = eps**0.5 if tolerance is None else _checks.number("tolerance", tolerance, positive=True)
+    return _fit(stacked, w, y, areas, penalty, max_steps, tolerance)
 
 
 @eqx.filter_jit
@@ -104,11 +104,12 @@ def _fit(
     max_steps: int,
     tolerance: float,
 ) -> LobeFit:
-    root = jnp.sqrt(areas)[:, None]
+    root = jnp.sqrt(areas / jnp.max(areas))[:, None]
     target = y.reshape(-1, w.shape[0]).T * root  # [N, C]
-    scale = jnp.sqrt(jnp.sum(target * target))
-    scale = eqx.error_if(scale, ~(scale > 0), "`values` are zero wherever they count: there is nothing to fit.")
-    target = target / scale
+    largest = jnp.max(jnp.abs(target))  # first, for squares of large and of small numbers leave the range
+    largest = eqx.error_if(largest, ~(largest > 0), "`values` are zero wherever they count: there is nothing to fit.")
+    length = jnp.sqrt(jnp.sum((target / largest) ** 2))
+    target = target / largest / length
 
     def error2(columns, weights):
         rest = columns @ weights - target
@@ -139,8 +140,9 @@ def _fit(
     weights = _best_weights(columns, target, ridge)
     seen_by = jnp.sum(columns**2, axis=0) ** 2 / jnp.sum(columns**4, axis=0)  # samples, or NaN
     status = FitStatus.where(_coincide(lobes), FitStatus.coincident, status)
-    status = FitStatus.where(jnp.all(seen_by > 1.5), status, FitStatus.degenerate)
-    lobes = lobes.with_linear((scale * weights.T).reshape(*y.shape[:-1], -1))
+    found = jnp.all(seen_by > 1.5) & jnp.all(jnp.isfinite(weights))
+    status = FitStatus.where(found, status, FitStatus.degenerate)
+    lobes = lobes.with_linear((largest * (length * weights.T)).reshape(*y.shape[:-1], -1))
     return LobeFit(lobes, jnp.sqrt(error2(columns, weights)), jnp.sum(steps), status)
 
 
@@ -164,7 +166,10 @@ def lobe_starts(
     """
     w, y, areas = _samples(directions, values, solid_angles)
     count, starts = _checks.integer("count", count, 1), _checks.integer("starts", starts, 1)
-    first = _peel(w, y.reshape(-1, w.shape[0]), areas, count)
+    largest = jnp.max(jnp.abs(y))
+    scale = jnp.where(largest > 0, largest, 1)
+    first = _peel(w, y.reshape(-1, w.shape[0]) / scale, areas, count)
+    first = first.with_linear(first.weights * scale)
     key = jax.random.key(0) if key is None else key
     z, log_sharpness = first.directions, jnp.log(first.sharpness)
     variations = [first]

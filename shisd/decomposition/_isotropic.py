@@ -18,9 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._methods import method
 from shisd._numerics import normalize, safe_sqrt, same_dtype
 from shisd._typing import Array, Float, Scalar
 from shisd.decomposition import _basis
@@ -89,27 +90,17 @@ class IsotropicBasis(eqx.Module):
         """The number K of axes per level."""
         return self.directions.shape[-2]
 
+    @method
     def zonal(self) -> Float[Array, "{self.degree}+1 {self.degree}+1"]:
         """Zonal coefficients beta[l, n] of the kernels, scaled as the basis uses them."""
-        beta = self.kernel.zonal(self.degree, dtype=self.directions.dtype)
-        if self.unit_norm:
-            beta = beta / jnp.sqrt(jnp.sum(beta * beta, axis=1, keepdims=True))
-        vanish = jnp.max(jnp.abs(beta), axis=0) <= 10 * jnp.finfo(beta.dtype).eps * jnp.max(jnp.abs(beta))
-        beta = eqx.error_if(beta, ~jnp.all(jnp.isfinite(beta)), "A level of the `kernel` is zero or not finite.")
-        messages = [
-            f"All levels of the `kernel` vanish on band {n}: nothing in that band can be represented. Take a kernel "
-            "that is not even or odd, narrower ones, or zonal harmonics (LegendreKernel)."
-            for n in range(self.degree + 1)
-        ]
-        return eqx.branched_error_if(beta, jnp.any(vanish), jnp.argmax(vanish), messages)
+        return _zonal(self)
 
+    @method
     def matrix(self) -> Float[Array, "n {self.degree}+1 {self.size}"]:
         """M of ISD15 Eq. 17 as [(L+1)^2, L+1, K]; zero for axes that a nested level does not use."""
-        y = sh_basis(_basis.unit_axes(self.directions), self.degree)  # [*levels, K, n]
-        m = convolve(y, self.zonal()[:, None])  # a delta at the axis, convolved with the kernel
-        return _basis.used_only(jnp.moveaxis(m, -1, 0), self.nested)
+        return _matrix(self)
 
-    @eqx.filter_jit
+    @method
     def weights(self, coefficients: ArrayLike, *, ridge: float = 0.0) -> Float[Array, "*batch l k"]:
         """Weights of least norm whose kernels add up to an expansion.
 
@@ -118,26 +109,21 @@ class IsotropicBasis(eqx.Module):
         Accuracy: coefficients come back within 10 eps times the condition number, for every kernel here.
         Cost: one QR of [(L+1) K, (L+1)^2]; for `LegendreKernel` band by band.
         """
-        c, m = same_dtype(_basis.check_coefficients(coefficients, self.degree), self.matrix())
-        return self._solve(m, c, _ridge(ridge))
+        c = _basis.check_coefficients(coefficients, self.degree)
+        return _weights(self, c, _checks.number("ridge", ridge))
 
-    @eqx.filter_jit
+    @method
     def solve(self, coefficients: ArrayLike, *, ridge: float = 0.0) -> Decomposition:
         """`weights`, with their residual and the condition number of M."""
-        c, m = same_dtype(_basis.check_coefficients(coefficients, self.degree), self.matrix())
-        weights = self._solve(m, c, _ridge(ridge))
-        norm = lambda a: safe_sqrt(jnp.sum(a * a, axis=-1))
-        size = norm(c)
-        residual = norm(_apply(m, weights) - c) / jnp.where(size > 0, size, 1)
-        return Decomposition(weights, residual, self._condition(m))
+        c = _basis.check_coefficients(coefficients, self.degree)
+        return _decompose(self, c, _checks.number("ridge", ridge))
 
-    @eqx.filter_jit
+    @method
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
         """SH coefficients [..., (L+1)^2] of a weighted sum, c = M lambda, from `weights` [..., L+1, K]."""
-        weights = _basis.check_weights(weights, self.degree, self.size, self.nested)
-        weights, m = same_dtype(weights, self.matrix())
-        return _apply(m, weights)
+        return _expand(self, _basis.check_weights(weights, self.degree, self.size, self.nested))
 
+    @method
     def evaluate(self, weights: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
         """Values of a weighted sum of the kernels, cut off above band L, at `directions` [..., 3] of any length.
 
@@ -145,15 +131,15 @@ class IsotropicBasis(eqx.Module):
         """
         return evaluate(self.coefficients(weights), directions)
 
-    @eqx.filter_jit
+    @method
     def condition_number(self) -> Scalar:
         """The largest over the smallest of the (L+1)^2 singular values of M (ISD15 Fig. 13).
 
         Derivatives: first order.
         """
-        return self._condition(self.matrix())
+        return _condition_number(self)
 
-    @eqx.filter_jit
+    @method
     def filter(self, weights: ArrayLike, signal: ArrayLike, rotations: ArrayLike) -> Float[Array, "*batch_colour"]:
         """Integrals of a signal times a turned kernel, sum lambda[l, k] (f * phi_l)(R z_lk), on the fly (ISD15 Eq. 6).
 
@@ -163,25 +149,18 @@ class IsotropicBasis(eqx.Module):
         Cost: for every rotation the harmonics at all axes; memory does not grow with the number of rotations.
         """
         signal = _basis.check_coefficients(signal, self.degree)
-        filtered = self._filtered(signal)  # [L+1, *colour, n]
+        return _filter(self, *self._rotated(weights, rotations, signal))
 
-        def one(w: Float[Array, "l k"], z: Float[Array, "*levels k 3"]) -> Array:
-            y = jnp.broadcast_to(sh_basis(z, self.degree), (*w.shape, signal.shape[-1]))
-            return jnp.einsum("lk,lkn,l...n->...", w, y, filtered)
-
-        return self._turned(one, weights, rotations, signal.dtype)
-
-    @eqx.filter_jit
+    @method
     def prefilter(self, signal: ArrayLike, height: int) -> Float[Array, "levels h w *colour"]:
         """Maps of the signal convolved with each mother kernel, f * phi_l (ISD15 Eq. 6): what `filter_maps` looks up.
 
         Arguments: `signal` [*colour, (L+1)^2], SH coefficients; static `height`. Returns equirectangular maps
         [L+1, height, 2 height, *colour]. Lookups are linear between texels, so errors fall with 1/height^2.
         """
-        filtered = self._filtered(_basis.check_coefficients(signal, self.degree))
-        return jnp.moveaxis(synthesize_map(filtered, height), 2, 0)
+        return _prefilter(self, _basis.check_coefficients(signal, self.degree), _checks.integer("height", height, 1))
 
-    @eqx.filter_jit
+    @method
     def filter_maps(self, weights: ArrayLike, maps: ArrayLike, rotations: ArrayLike) -> Float[Array, "*batch_colour"]:
         """As `filter`, by lookups in the maps of `prefilter`."""
         texels = _checks.real_array("maps", maps)
@@ -189,13 +168,7 @@ class IsotropicBasis(eqx.Module):
             raise ValueError(
                 f"`maps` must come from `prefilter`, [{self.degree + 1}, H, 2 H, *colour]; got {list(texels.shape)}."
             )
-
-        def one(w: Float[Array, "l k"], z: Float[Array, "*levels k 3"]) -> Array:
-            z = jnp.broadcast_to(z, (*w.shape, 3))
-            look_up = jax.vmap(lambda image, at: sample_map(image, at, texels="samples"))
-            return jnp.einsum("lk,lk...->...", w, look_up(texels, z))
-
-        return self._turned(one, weights, rotations, texels.dtype)
+        return _filter_maps(self, *self._rotated(weights, rotations, texels))
 
     def _blocks(self, m: Float[Array, "n l k"]) -> Float[Array, "l rows k"]:
         """The blocks M_l of a kernel whose level l is band l, stacked and padded."""
@@ -224,10 +197,8 @@ class IsotropicBasis(eqx.Module):
         levels = self.degree + 1
         return convolve(signal, self.zonal().reshape(levels, *(1,) * (signal.ndim - 1), levels))
 
-    def _turned(
-        self, one: Callable[[Array, Array], Array], weights: ArrayLike, rotations: ArrayLike, dtype: DTypeLike
-    ) -> Array:
-        """one(weights, R z) for all rotations."""
+    def _rotated(self, weights: ArrayLike, rotations: ArrayLike, signal: Array) -> tuple[Array, Array, Array]:
+        """Checked weights and rotations of one batch, and the signal, in one dtype."""
         weights = _basis.check_weights(weights, self.degree, self.size, self.nested)
         r = _checks.real_array("rotations", rotations)
         if r.shape[-2:] != (3, 3):
@@ -238,12 +209,9 @@ class IsotropicBasis(eqx.Module):
             raise ValueError(
                 f"leading axes of `weights` {list(weights.shape)} and `rotations` {list(r.shape)} do not broadcast."
             ) from error
-        dtype = jnp.result_type(weights, r, self.directions, dtype)
-        axes = _basis.unit_axes(self.directions).astype(dtype)
-        flat = lambda a: jnp.broadcast_to(a.astype(dtype), (*batch, *a.shape[-2:])).reshape(-1, *a.shape[-2:])
-        turned = lambda a: one(a[0], jnp.einsum("ij,...j->...i", a[1], axes, precision="highest"))
-        values = jax.lax.map(turned, (flat(weights), flat(r)))
-        return values.reshape(*batch, *values.shape[1:])
+        dtype = jnp.result_type(weights, r, self.directions, signal)
+        weights, r = (jnp.broadcast_to(a.astype(dtype), (*batch, *a.shape[-2:])) for a in (weights, r))
+        return weights, r, signal.astype(dtype)
 
 
 _SINGULAR = (
@@ -253,10 +221,88 @@ _SINGULAR = (
 
 
 def _apply(m: Float[Array, "n l k"], weights: Float[Array, "*batch l k"]) -> Float[Array, "*batch n"]:
+    m, weights = same_dtype(m, weights)
     return jnp.einsum("nlk,...lk->...n", m, weights, precision="highest")
 
 
-def _ridge(ridge: float) -> float:
-    if not (isinstance(ridge, (int, float)) and ridge >= 0):
-        raise ValueError(f"`ridge` must be a Python number >= 0; got {ridge!r}.")
-    return float(ridge)
+@eqx.filter_jit
+def _zonal(basis: IsotropicBasis) -> Float[Array, "levels bands"]:
+    beta = basis.kernel.zonal(basis.degree, dtype=basis.directions.dtype)
+    if basis.unit_norm:
+        beta = beta / jnp.sqrt(jnp.sum(beta * beta, axis=1, keepdims=True))
+    vanish = jnp.max(jnp.abs(beta), axis=0) <= 10 * float(jnp.finfo(beta.dtype).eps) * jnp.max(jnp.abs(beta))
+    beta = eqx.error_if(beta, ~jnp.all(jnp.isfinite(beta)), "A level of the `kernel` is zero or not finite.")
+    messages = [
+        f"All levels of the `kernel` vanish on band {n}: nothing in that band can be represented. Take a kernel "
+        "that is not even or odd, narrower ones, or zonal harmonics (LegendreKernel)."
+        for n in range(basis.degree + 1)
+    ]
+    return eqx.branched_error_if(beta, jnp.any(vanish), jnp.argmax(vanish), messages)
+
+
+@eqx.filter_jit
+def _matrix(basis: IsotropicBasis) -> Float[Array, "n l k"]:
+    y = sh_basis(_basis.unit_axes(basis.directions), basis.degree)  # [*levels, K, n]
+    m = convolve(y, _zonal(basis)[:, None])  # a delta at the axis, convolved with the kernel
+    return _basis.used_only(jnp.moveaxis(m, -1, 0), basis.nested)
+
+
+@eqx.filter_jit
+def _weights(basis: IsotropicBasis, c: Float[Array, "*batch n"], ridge: float) -> Float[Array, "*batch l k"]:
+    return basis._solve(_matrix(basis), c, ridge)
+
+
+@eqx.filter_jit
+def _decompose(basis: IsotropicBasis, c: Float[Array, "*batch n"], ridge: float) -> Decomposition:
+    m = _matrix(basis)
+    weights = basis._solve(m, c, ridge)
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(c), axis=-1, keepdims=True))
+    scale = jnp.where(largest > 0, largest, 1)  # squares of large and of small numbers leave the range
+    norm = lambda a: safe_sqrt(jnp.sum((a / scale) ** 2, axis=-1))
+    size = norm(c)
+    residual = norm(_apply(m, weights) - c) / jnp.where(size > 0, size, 1)
+    return Decomposition(weights, residual, basis._condition(m))
+
+
+@eqx.filter_jit
+def _expand(basis: IsotropicBasis, weights: Float[Array, "*batch l k"]) -> Float[Array, "*batch n"]:
+    return _apply(_matrix(basis), weights)
+
+
+@eqx.filter_jit
+def _condition_number(basis: IsotropicBasis) -> Scalar:
+    return basis._condition(_matrix(basis))
+
+
+@eqx.filter_jit
+def _filter(basis: IsotropicBasis, weights: Array, rotations: Array, signal: Array) -> Float[Array, "*batch_colour"]:
+    filtered = basis._filtered(signal)  # [L+1, *colour, n]
+
+    def one(w: Float[Array, "l k"], z: Float[Array, "*levels k 3"]) -> Array:
+        y = jnp.broadcast_to(sh_basis(z, basis.degree), (*w.shape, signal.shape[-1]))
+        return jnp.einsum("lk,lkn,l...n->...", w, y, filtered)
+
+    return _turned(one, basis, weights, rotations)
+
+
+@eqx.filter_jit
+def _prefilter(basis: IsotropicBasis, signal: Array, height: int) -> Float[Array, "levels h w *colour"]:
+    return jnp.moveaxis(synthesize_map(basis._filtered(signal), height), 2, 0)
+
+
+@eqx.filter_jit
+def _filter_maps(basis: IsotropicBasis, weights: Array, rotations: Array, texels: Array) -> Array:
+    def one(w: Float[Array, "l k"], z: Float[Array, "*levels k 3"]) -> Array:
+        z = jnp.broadcast_to(z, (*w.shape, 3))
+        look_up = jax.vmap(lambda image, at: sample_map(image, at, texels="samples"))
+        return jnp.einsum("lk,lk...->...", w, look_up(texels, z))
+
+    return _turned(one, basis, weights, rotations)
+
+
+def _turned(one: Callable[[Array, Array], Array], basis: IsotropicBasis, weights: Array, rotations: Array) -> Array:
+    """one(weights, R z) for all rotations."""
+    axes = _basis.unit_axes(basis.directions).astype(weights.dtype)
+    turned = lambda a: one(a[0], jnp.einsum("ij,...j->...i", a[1], axes, precision="highest"))
+    values = jax.lax.map(turned, tuple(a.reshape(-1, *a.shape[-2:]) for a in (weights, rotations)))
+    return values.reshape(*weights.shape[:-2], *values.shape[1:])

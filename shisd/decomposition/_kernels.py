@@ -15,6 +15,7 @@ band, and the decomposition does not exist.
 """
 
 import abc
+import math
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -52,7 +53,8 @@ def _widths(
     if len(widths) <= degree:
         raise ValueError(f"The kernel has widths for {len(widths)} levels; degree {degree} needs {degree + 1}.")
     widths = widths[: degree + 1].astype(dtype)
-    return eqx.error_if(widths, ~jnp.all(widths >= 0), "The widths of the kernel must be finite and not negative.")
+    good = (widths >= 0) & (widths < jnp.inf)
+    return _checks.require(widths, good, "The widths of the kernel must be finite and not negative.")
 
 
 class AbstractKernel(eqx.Module):
@@ -166,7 +168,7 @@ class PhongKernel(AbstractKernel):
         x = _checks.real_array("x", x)
         a = self._exponents(_checks.integer("level", level), x.dtype)[-1]
         above = jnp.where(x > 0, jnp.where(x > 0, x, 1) ** a, 0)
-        return jnp.where(a == 0, 1, above)
+        return jnp.where(jnp.isnan(x), x, jnp.where(a == 0, 1, above))
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
@@ -194,7 +196,8 @@ class CapKernel(AbstractKernel):
 
     def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
         x = _checks.real_array("x", x)
-        return (x >= jnp.cos(self._angles(_checks.integer("level", level), x.dtype)[-1])).astype(x.dtype)
+        inside = (x >= jnp.cos(self._angles(_checks.integer("level", level), x.dtype)[-1])).astype(x.dtype)
+        return jnp.where(jnp.isnan(x), x, inside)
 
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
@@ -204,7 +207,9 @@ class CapKernel(AbstractKernel):
 
     def _angles(self, degree: int, dtype: DTypeLike) -> Float[Array, " levels"]:
         angles = _widths(self.angles, degree, lambda l: min(2.405 / (l + 0.5), np.pi), dtype)
-        return eqx.error_if(angles, jnp.any((angles <= 0) | (angles > 3.2)), "`angles` must be above 0 and at most pi.")
+        largest = np.pi * (1 + 2 * float(jnp.finfo(angles.dtype).eps))
+        good = (angles > 0) & (angles <= largest)
+        return _checks.require(angles, good, "`angles` must be above 0 and at most pi.")
 
 
 class FunctionKernel(AbstractKernel):
@@ -232,11 +237,12 @@ class FunctionKernel(AbstractKernel):
         nodes = 256 + 2 * degree if self.quadrature is None else _checks.integer("quadrature", self.quadrature, 4)
         fine, coarse = (self._integrals(degree, count, dtype) for count in (nodes, 3 * nodes // 4))
         limit = 1e-3 * jnp.max(jnp.abs(fine), axis=1, keepdims=True)
-        return eqx.error_if(
+        return _checks.require(
             fine,
-            ~jnp.all(jnp.abs(fine - coarse) <= limit),
-            "The quadrature does not resolve `function`: fewer nodes give other zonal coefficients, or it is not "
-            "finite. Pass a larger `quadrature`, a smoother function, or CapKernel for discs.",
+            jnp.abs(fine - coarse) <= limit,
+            f"The quadrature does not resolve `function` by {nodes} nodes: three quarters of them give other zonal "
+            f"coefficients, or it is not finite. Pass `quadrature={2 * nodes}`, a smoother function, or CapKernel for "
+            "discs.",
         )
 
     def _integrals(self, degree: int, nodes: int, dtype: DTypeLike) -> Float[Array, "{degree}+1 {degree}+1"]:
@@ -262,7 +268,7 @@ _NODES = 32  # for exp(-t) over the part of its range that is above the rounding
 
 def _extent(sharpness: Float[Array, " k"]) -> Float[Array, " k"]:
     """h, beyond which exp(-sharpness t) is below the rounding."""
-    negligible = -np.log(float(jnp.finfo(sharpness.dtype).eps)) + 2
+    negligible = -math.log(float(jnp.finfo(sharpness.dtype).eps)) + 2
     return jnp.minimum(2, negligible / jnp.maximum(sharpness, negligible / 2))
 
 

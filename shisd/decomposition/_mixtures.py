@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._methods import method
 from shisd._numerics import normalize
 from shisd._typing import Array, Float
 from shisd.decomposition._kernels import gaussian_zonal
@@ -29,6 +30,7 @@ class AbstractLobes(eqx.Module):
         """The number J of lobes."""
         return self.directions.shape[0]
 
+    @method
     def evaluate(self, directions: ArrayLike) -> Float[Array, "*colour_batch"]:
         """Values [*colour, ...] at directions w [..., 3], taken as unit vectors along them.
 
@@ -84,6 +86,7 @@ class GaussianLobes(AbstractLobes):
                 f"{list(self.sharpness.shape)}."
             )
 
+    @method
     def coefficients(self, degree: int) -> Float[Array, "*colour n"]:
         zonal = gaussian_zonal(self.sharpness, _checks.degree(degree))  # [J, L+1]
         lobes = _rotated(self.directions, zonal)
@@ -122,6 +125,7 @@ class ZonalLobes(AbstractLobes):
     def degree(self) -> int:
         return self.weights.shape[-2] - 1
 
+    @method
     def coefficients(self, degree: int) -> Float[Array, "*colour n"]:
         own = min(_checks.degree(degree), self.degree)
         zonal = jnp.moveaxis(self.weights[..., : own + 1, :], -1, -2)  # [*colour, J, l]

@@ -1,5 +1,7 @@
 """Rotated zonal harmonics: exact inverse maps, least norm, conditioning, derivatives, refusals."""
 
+import logging
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -197,6 +199,42 @@ def test_jit_equals_eager_and_compiles_once(dtype, rng):
         for a, b in zip(run(basis, c, at), eager, strict=True):
             assert a.dtype == dtype
             np.testing.assert_allclose(a, b, atol=30 * np.finfo(dtype).eps, rtol=30 * np.finfo(dtype).eps)
+
+
+def test_float32_axes_keep_their_precision_where_x64_is_on(x64, as_user):
+    z = decomposition.optimized_directions(2, dtype=np.float32)
+    plane = circle(5) @ np.linalg.qr([[1, 2, 3], [2, 1, -1], [0, 1, 1.0]])[0]
+    for dtype in (np.float32, np.float64):  # of the coefficients
+        assert weights_of(RotatedZonalBasis(z, 2), np.ones(9, dtype)).dtype == dtype
+        for singular in (plane, np.concatenate([z[:1], z[:4]])):
+            with pytest.raises(RuntimeError, match="do not resolve degree"):
+                weights_of(RotatedZonalBasis(singular.astype(np.float32), 2), np.ones(9, dtype))
+
+
+def test_methods_compile_once_and_jit_takes_them(rng, caplog):
+    z, c = decomposition.optimized_directions(2), rng.standard_normal(9).astype(np.float32)
+    basis, gaussian = RotatedZonalBasis(z, 2), decomposition.GaussianKernel()
+    few = decomposition.GaussianLobes(z, np.ones(5, np.float32), np.ones(5, np.float32))
+    weights = jax.jit(basis.weights)(c)
+    np.testing.assert_array_equal(weights, basis.weights(c))
+    calls = (
+        lambda: basis.weights(c),
+        basis.condition_numbers,
+        lambda: basis.coefficients(weights),
+        lambda: basis.evaluate(weights, z),
+        lambda: few.coefficients(2),
+        lambda: decomposition.ZonalLobes(z, weights).evaluate(z),
+        lambda: decomposition.conditioning_loss(z, 2),
+        lambda: gaussian.zonal(2),
+        lambda: gaussian(c, 1),
+        decomposition.IsotropicBasis(gaussian, decomposition.separate_directions(1), 1).matrix,
+    )
+    for call in calls:
+        call()
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        for call in calls:
+            call()
+    assert not [record.message for record in caplog.records if "ompil" in record.message]
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------

@@ -139,7 +139,30 @@ def test_ridge_cures_axes_that_levels_share(rng):
     with pytest.raises(RuntimeError, match="separate_directions"):
         basis.weights(c)
     found = basis.solve(c, ridge=1e-6)
-    assert np.all(np.isfinite(found.weights)) and 1e-5 < float(found.residual) < 0.7
+    y = truth.sh(np.asarray(z, float), 7)  # [K, n]
+    x, gauss = np.polynomial.legendre.leggauss(200)
+    m = np.zeros((64, 8, 15))
+    bands = np.repeat(np.arange(8), 2 * np.arange(8) + 1)
+    for l in range(8):
+        p = np.polynomial.legendre.legvander(x, 7)
+        beta = (gauss * np.exp(-(1 - x) * l * l)) @ p * np.sqrt(2 * np.arange(8) + 1)
+        pi = np.sqrt(4 * np.pi / (2 * np.arange(8) + 1))
+        m[:, l, : 2 * l + 1] = ((beta / np.linalg.norm(beta) * pi)[bands] * y[: 2 * l + 1]).T
+    m = m.reshape(64, -1)
+    square = m @ m.T
+    left = c - square @ np.linalg.solve(square + 1e-6 * np.trace(square) / 64 * np.eye(64), c)
+    np.testing.assert_allclose(found.residual, np.linalg.norm(left) / np.linalg.norm(c), rtol=2e-2)
+
+
+def test_residuals_at_every_scale(rng):
+    basis = IsotropicBasis(decomposition.GaussianKernel(), decomposition.separate_directions(3), 3)
+    c = rng.standard_normal(16)
+    m = np.asarray(basis.matrix(), float).reshape(16, -1)
+    square = m @ m.T
+    left = c - square @ np.linalg.solve(square + 1e-2 * np.trace(square) / 16 * np.eye(16), c)
+    expected = np.linalg.norm(left) / np.linalg.norm(c)
+    residual = basis.solve((c * np.array([[1], [1e25], [1e-30], [np.nan]])).astype(np.float32), ridge=1e-2).residual
+    np.testing.assert_allclose(residual, [expected] * 3 + [np.nan], rtol=1e-4)
 
 
 def test_a_zero_function_has_zero_weights_and_no_residual(x64):
@@ -268,7 +291,8 @@ def test_bad_shapes_are_refused(as_user):
         (lambda: IsotropicBasis(kernel, z[:2], 2), r"\[degree \+ 1, K, 3\] = \[3, K, 3\].*got \[2, 5, 3\]"),
         (lambda: IsotropicBasis(kernel, z[:, :4], 2), r"at least 2\*degree \+ 1 = 5 axes for degree 2; got 4"),
         (lambda: basis.weights(np.ones(4)), "`coefficients` must be of the basis' degree 2"),
-        (lambda: basis.weights(np.ones(9), ridge=-1.0), "`ridge` must be a Python number >= 0; got -1.0"),
+        (lambda: basis.weights(np.ones(9), ridge=-1.0), "`ridge` must be finite and >= 0; got -1.0"),
+        (lambda: basis.weights(np.ones(9), ridge=np.inf), "`ridge` must be finite and >= 0; got inf"),
         (lambda: basis.coefficients(np.ones((3, 4))), r"`weights` must have shape .*\[..., 3, 5\]; got \[3, 4\]"),
         (lambda: basis.filter(np.ones((3, 5)), np.ones(9), np.ones((2, 3))), r"`rotations` must have shape"),
         (lambda: basis.filter(np.ones((2, 3, 5)), np.ones(9), np.ones((4, 3, 3))), "do not broadcast"),

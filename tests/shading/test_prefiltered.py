@@ -35,6 +35,7 @@ def light(rng):
 MATERIALS = {
     "diffuse": lambda: models.Lambertian(0.7),
     "glossy": lambda: models.Ggx(0.4, np.array([0.9, 0.6, 0.3])),
+    "rough": lambda: models.Ggx(0.8, np.array([0.9, 0.6, 0.3])),
 }
 
 
@@ -54,10 +55,18 @@ def test_error_is_as_predicted(material, dtype, rng):
         filtered = shading.prefilter(lobes, e, tolerance=tolerance)
         got = shading.shade_prefiltered(filtered, n, v)
         assert got.dtype == dtype and got.shape == (4000, 3)
-        error = np.sqrt(np.mean((np.asarray(got) - truth) ** 2) / np.mean(truth**2))
+        error = np.max(np.sqrt(np.mean((np.asarray(got) - truth) ** 2, axis=0) / np.mean(truth**2, axis=0)))
         predicted = float(filtered.error)
         assert predicted <= tolerance
         assert predicted / 2 - 5e-4 < error < 2 * predicted + 5e-4  # 5e-4: the splines, with all channels
+    if material == "glossy":
+        first, other = shading.prefilter(lobes, e), lobes_of("rough", dtype)
+        truth = np.asarray(shading.shade_environment(other, 2 * e[::-1], n, v))
+        filtered = jax.jit(lambda e: shading.prefilter(other, e, like=first))(2 * e[::-1])
+        left = np.asarray(shading.shade_prefiltered(filtered, n, v)) - truth
+        error = np.max(np.sqrt(np.mean(left**2, axis=0) / np.mean(truth**2, axis=0)))
+        assert error > 5 * float(first.error)  # its channels are for another material
+        np.testing.assert_allclose(filtered.error, error, rtol=0.2)
     if material == "diffuse":  # view-independent and zonal about the normal
         assert int(shading.prefilter(lobes, e, tolerance=1e-4).channels) == 1 and not bool(filtered.mirror)
 
@@ -101,8 +110,11 @@ def test_no_light_and_views_below(rng):
 
 def test_what_cannot_be_filtered_is_refused(rng, as_user):
     lobes, e = lobes_of("glossy", np.dtype("float32")), light(rng).astype(np.float32)
-    with pytest.raises(ValueError, match="tolerance"):
-        shading.prefilter(lobes, e, tolerance=0.0)
+    for bad in (0.0, np.inf):
+        with pytest.raises(ValueError, match="`tolerance` must be finite and > 0"):
+            shading.prefilter(lobes, e, tolerance=bad)
+    with pytest.raises(ValueError, match="`light_coefficients` must be finite"):
+        shading.prefilter(lobes, e * np.float32(np.nan))
     with pytest.raises(ValueError, match="pass that as `like`"):
         jax.jit(lambda e: shading.prefilter(lobes, e).maps)(e)
     with pytest.raises(ValueError, match="`light_coefficients`"):
