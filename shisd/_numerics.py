@@ -1,6 +1,7 @@
 """Small numerical helpers that every stage shares."""
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +92,7 @@ def arctan2(y: Array, x: Array) -> Array:
     """
     a, b = jnp.abs(y), jnp.abs(x)
     large, small = jnp.maximum(a, b), jnp.minimum(a, b)
-    wide = small > np.tan(np.pi / 8) * large  # then the angle to the diagonal
+    wide = small > math.tan(np.pi / 8) * large  # then the angle to the diagonal
     over = jnp.where(wide, small + large, jnp.where(large > 0, large, 1))
     t = jnp.where(wide, small - large, small) / over
     series = jnp.zeros_like(t)

@@ -140,7 +140,7 @@ def test_light_by_direction(dtype, rng):
     lobes, e = lobes_of("glossy", 4, dtype.name), rng.normal(size=(3, 16)).astype(dtype)
     tolerance = {"float64": 1e-12, "float32": 3e-5}[dtype.name]
     points, arrays = QUAD.astype(dtype), [a.astype(dtype) for a in (position, normal, view)]
-    portal = models.PortalLight(points, e, 5)
+    portal = models.PortalLight(points, e)
     distant = lambda w: truth.scipy_basis(w, 3) @ e.astype(float).T
     leaving = lambda w: 0.7 * distant(-w)
     light = models.PolygonLight(points, np.asarray(0.7, dtype), profile=e)
@@ -151,7 +151,7 @@ def test_light_by_direction(dtype, rng):
         expected = expected_radiance(lobes, radiance, position, normal, view)
         assert got.dtype == dtype
         np.testing.assert_allclose(got, expected, atol=tolerance * np.max(np.abs(expected)))
-    outside = models.PortalLight(points[::-1].copy(), e, 4)
+    outside = models.PortalLight(points[::-1].copy(), e)
     np.testing.assert_array_equal(shading.shade_portal(lobes, outside, *arrays), 0)
 
 
@@ -163,7 +163,7 @@ def test_a_uniform_profile_and_several_portals(rng):
     shaped = models.PolygonLight(quad, np.asarray([1, 2], np.float32), profile=one)
     got = shading.shade_polygon(lobes, [shaped, models.PolygonLight(quad)], position, normal, view)
     np.testing.assert_allclose(got, plain[:, None] * [2, 3], rtol=1e-4, atol=1e-6)
-    portal = models.PortalLight(quad, one, 4)
+    portal = models.PortalLight(quad, one)
     got = shading.shade_portal(lobes, [portal, portal], position, normal, view)
     np.testing.assert_allclose(got, 2 * plain, rtol=1e-4, atol=1e-6)
 
@@ -175,7 +175,7 @@ def test_projected_light(dtype, rng):
     e, quad = rng.normal(size=(3, 9)).astype(dtype), QUAD.astype(dtype)
     lights = {
         "plain": (models.PolygonLight(quad, np.asarray([1, 2], dtype)), lambda w: np.broadcast_to([1, 2], (len(w), 2))),
-        "portal": (models.PortalLight(quad, e, 5), lambda w: truth.scipy_basis(w, 2) @ e.astype(float).T),
+        "portal": (models.PortalLight(quad, e), lambda w: truth.scipy_basis(w, 2) @ e.astype(float).T),
     }
     haar = domains.HaarBasis(1)
     for light, radiance in lights.values():
@@ -247,7 +247,7 @@ def test_derivatives_of_views_near_the_normal(sine, x64, rng):
 def test_derivatives_of_portals(x64, rng):
     position, normal, view = (a[1:4] for a in scene(rng, 4))
     lobes = lobes_of("glossy", 4, "float64")
-    shade = lambda points, e, *surface: shading.shade_portal(lobes, models.PortalLight(points, e, 4), *surface)
+    shade = lambda points, e, *surface: shading.shade_portal(lobes, models.PortalLight(points, e), *surface)
     check_grads(shade, (QUAD, rng.normal(size=9), position, normal, view), order=1, rtol=1e-6, atol=1e-8)
     project = lambda points, p: shading.project_light(models.PolygonLight(points), p, domains.HaarBasis(1))
     check_grads(project, (QUAD, position), order=1, rtol=1e-6, atol=1e-8, eps=1e-5)
@@ -275,8 +275,6 @@ def test_bad_input_is_named(as_user):
         shading.project_light(QUAD, up, 2)
     with pytest.raises(ValueError, match="`portal` must be a models.PortalLight"):
         shading.shade_portal(lobes, models.PolygonLight(QUAD), up, up, up)
-    with pytest.raises(ValueError, match="pass PortalLight"):
-        shading.shade_portal(lobes, models.PortalLight(QUAD, np.ones(4), 3), up, up, up)
     with pytest.raises(ValueError, match="do not broadcast"):
         models.PolygonLight(QUAD, np.ones(2), profile=np.ones((3, 4)))
     with pytest.raises(ValueError, match="`domain` must be"):
