@@ -118,7 +118,7 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
             points = [a[mask].astype(np.float32) for a in (positions, normals, -flat)]
             if name == "window":
                 corners, emission = window(), expansion
-                light = models.PortalLight(corners.astype(np.float32), coefficients, DEGREES[surface])
+                light = models.PortalLight(corners.astype(np.float32), coefficients)
                 shade = shading.shade_portal
             else:
                 corners, emission = lights()[name]

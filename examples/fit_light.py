@@ -53,7 +53,7 @@ def chain(picture: _fit.Picture) -> Callable:
     harmonics = jnp.eye((LIGHT_DEGREE + 1) ** 2, dtype=points.dtype)
     sky = shading.shade_environment(sky_lobes, harmonics, points, views)
 
-    portal = models.PortalLight(known["outline"], harmonics, DEGREE)  # its product with the light is for all places
+    portal = models.PortalLight(known["outline"], harmonics)
 
     def images(place: jax.Array) -> jax.Array:
         corners = known["outline"] + place

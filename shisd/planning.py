@@ -54,7 +54,7 @@ class Scene(eqx.Module):
     """What is to be shaded: every material under the sum of all lights, without occlusion.
 
     Arguments: `materials` and `lights` by name; a light is a `models.Environment`, SH coefficients [n] or [colour, n]
-    of distant light, a `models.PolygonLight` or a `models.PortalLight` (whose degree the plan chooses anew); `points`
+    of distant light, a `models.PolygonLight` or a `models.PortalLight`; `points`
     [N, 3], representative positions of surfaces, which judge the local lights. A dozen will do: each costs a
     projection.
     """
@@ -321,7 +321,7 @@ class Portal(Path):
     @classmethod
     def make(cls, material, tables, lights, degree):
         portal = lights[0].light
-        return cls(tables.lobes(degree, above=True), PortalLight(portal.points, portal.coefficients, degree))
+        return cls(tables.lobes(degree, above=True), portal)
 
     def shade(self, positions, normals, views, tangents):
         return shade_portal(self.lobes, self.light, positions, normals, views, tangents)

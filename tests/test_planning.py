@@ -178,7 +178,7 @@ def test_windows(rng):
     """The light through it, and the radiance, against quadrature of both."""
     e = rng.normal(size=9).astype(np.float32) * 0.2
     e[0] = 2.0
-    portal, brdf = models.PortalLight(LAMP, e, 0), MATERIALS["satin"]
+    portal, brdf = models.PortalLight(LAMP, e), MATERIALS["satin"]
     made = planning.plan(planning.Scene({"it": brdf}, {"window": portal}, scene().points), 0.03, max_degree=8)
     assert made.entries[0].path == "portal" and made.met
     where = pixels(rng, 200)

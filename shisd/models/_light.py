@@ -56,40 +56,27 @@ class PortalLight(eqx.Module):
     """A window: a polygon in world space through which distant light is seen (CSH18 section 5.1).
 
     Arguments: `points` [S, 3] as those of a `PolygonLight`, counter-clockwise seen from the side that is lit;
-    `coefficients` [n] or [colour, n], SH coefficients of the distant radiance in world space; static `degree`, the
-    highest of the lobes to be lit by it (or of the expansions wanted of it).
-    The matrix of the product of a lobe with the distant light, `product` [*colour, (Le+degree+1)^2, (degree+1)^2], is
-    computed here, once for all points and views (CSH18 Eq. 14), without loss.
+    `coefficients` [n] or [colour, n], SH coefficients of the distant radiance in world space.
     """
 
     points: Float[Array, "s 3"]
     coefficients: Float[Array, "*colour_n"]
-    product: Float[Array, "*colour_n_m"]
-    degree: int = eqx.field(static=True)
     two_sided: ClassVar[bool] = False
 
-    def __init__(self, points: ArrayLike, coefficients: ArrayLike, degree: int):
+    def __init__(self, points: ArrayLike, coefficients: ArrayLike):
         p, (c, _) = _checks.outline("points", points), _checks.expansion("coefficients", coefficients)
-        self.degree = _checks.degree(degree)
         dtype = jnp.promote_types(p.dtype, c.dtype)
         self.points, self.coefficients = p.astype(dtype), c.astype(dtype)
-        self.product = lobe_product(self.coefficients, self.degree)
 
     @property
     def colour(self) -> tuple[int, ...]:
         return self.coefficients.shape[:-1]
 
 
-def lobe_product(light: Float[Array, "*colour_n"], degree: int) -> Float[Array, "*colour_n_m"]:
-    """From coefficients of a lobe of this degree to those of its product with a light, all of them."""
-    light_degree = _checks.degree_of(light.shape[-1])
-    return product_matrices(light, light_degree + degree, degree)
-
-
 def product_matrices(light: Float[Array, "*colour_n"], degree: int, input_degree: int) -> Float[Array, "*colour_n_m"]:
     """`harmonics.product_matrix` of the light of every colour."""
-    rows = [product_matrix(c, degree, input_degree=input_degree) for c in light.reshape(-1, light.shape[-1])]
-    return jnp.stack(rows).reshape(*light.shape[:-1], *rows[0].shape)
+    of_one = lambda c: product_matrix(c, degree, input_degree=input_degree)
+    return of_one(light) if light.ndim == 1 else jax.vmap(of_one)(light)
 
 
 class SphereLight(eqx.Module):
@@ -125,8 +112,9 @@ class SphereLight(eqx.Module):
         """Coefficients of y_l^0 about the direction to the center, of the radiance at a distance from it (Eq. 33).
 
         Arguments: `distance` [...], in the unit of length of the scene; static `degree`. Returns [..., *colour, L+1].
-        Inside the ball its surface is all around: the constant radiance. At the surface the value jumps by that of a
-        hemisphere; from outside its derivative goes there to infinity, as that of the solid angle does.
+        Inside the ball its surface is all around: the constant radiance. A `radius` that is not positive gives NaN. At
+        the surface the value jumps by that of a hemisphere; from outside its derivative goes there to infinity, as that
+        of the solid angle does.
         """
         d, degree = _checks.real_array("distance", distance), _checks.degree(degree)
         dtype = jnp.promote_types(d.dtype, self.radius.dtype)
@@ -136,10 +124,11 @@ class SphereLight(eqx.Module):
 
 
 def versine(light: SphereLight, distance2: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """1 - cos of the angle that a ball covers, by the square of the distance; 2 inside of it.
+    """1 - cos of the angle that a ball covers, by the square of the distance; 2 inside of it, NaN of one of no size.
 
     With s = sin = radius / distance, it is s^2 / (1 + sqrt(1 - s^2)), which keeps its digits for small balls.
     """
-    outside = distance2 > light.radius**2
-    sine2 = light.radius**2 / jnp.where(outside, distance2, 2 * light.radius**2)
-    return jnp.where(outside, sine2 / (1 + jnp.sqrt(1 - sine2)), 2)
+    radius2 = light.radius**2 * jnp.where(light.radius > 0, 1, jnp.nan)
+    inside = distance2 <= radius2
+    sine2 = radius2 / jnp.where(inside, 2 * radius2, distance2)
+    return jnp.where(inside, 2, sine2 / (1 + jnp.sqrt(1 - sine2)))

@@ -32,27 +32,32 @@ def shade_environment(
     normals: ArrayLike,
     views: ArrayLike,
     tangents: ArrayLike | None = None,
+    *,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under distant light (ISD15 Eq. 22).
 
     Arguments: `lobes` from `tabulate_brdf`; `light_coefficients` [*colour, n], SH coefficients of the incident
     radiance in world space; `normals` and `views` [..., 3] in world space, of any length, pointing away from the
     surface; `tangents` [..., 3], the local x axis of anisotropic materials (needed for these, ignored for others; only
-    its part along the surface counts). Colours of lobes and light broadcast: scalar or RGB. Bands that only one of the
-    two has add nothing. Returns [..., *colour] in W/(m2 sr), or the light's unit. A view below the horizon gives 0; a
-    zero or NaN normal or view gives NaN.
+    its part along the surface counts); `mask` [...], bool: where it is False, radiance is 0 with gradient 0, whatever
+    the other arrays hold there, as pixels of the background do. Colours of lobes and light broadcast: scalar or RGB.
+    Bands that only one of the two has add nothing. Returns [..., *colour] in W/(m2 sr), or the light's unit. A view
+    that is not above the horizon gives 0. A NaN anywhere, a zero normal or view, and a tangent along the normal give
+    NaN, with NaN gradients.
     Derivatives: in every floating argument, both modes, any order, also where a normal lies along an axis of the world;
     where a view lies along its normal, the first. The cut at the horizon is a discontinuity of the view, with no
     gradient.
     Accuracy: Eq. 22 to 1e-5 in float32 and 1e-12 in float64, relative to the largest radiance.
-    Cost: about L^3 products per pixel. Memory: one tile of at most 4096 pixels, about 3 MB per array, and the
-    result; the same with gradients.
+    Cost: about L^3 products per pixel. The batch is filled up to one of few sizes, by at most an eighth (powers of two
+    up to 64), so that a new number of pixels seldom compiles anything that takes long. Memory: one tile of at most 4096
+    pixels, about 3 MB per array, and the result; the same with gradients.
     Source: ISD15 Eq. 20-22.
     """
     check_lobes(lobes, everywhere=True)
     e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
     light = [("light_coefficients", e.shape[:-1])]
-    lobes, points, colour = surface("lobes", lobes, tangents, light, [e.dtype], normals=normals, views=views)
+    lobes, points, colour = surface("lobes", lobes, tangents, light, [e.dtype], mask, normals=normals, views=views)
     degree = min(light_degree, lobes.degree)
     e = e[..., : (degree + 1) ** 2].astype(lobes.weights.dtype)
     return by_device(shade_points, points, _shade, lobes, e, colour)
@@ -82,4 +87,4 @@ def shade_slices(
 
     numbers = (degree + 1) ** 2 * int(np.prod(material.colour))
     size = min(_LARGEST_TILE, max(1, _NUMBERS_AT_ONCE // numbers))
-    return shade_tiles(material, points, colour, size, radiance)
+    return shade_tiles(material, points, colour, size, radiance, e)

@@ -196,10 +196,12 @@ def shade_matrix(
     normals: ArrayLike,
     views: ArrayLike,
     tangents: ArrayLike | None = None,
+    *,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under distant light: `shade_environment` with a matrix.
 
-    Arguments: `matrix` from `project_brdf` with domain="sphere"; the others and what is returned as in
+    Arguments: `matrix` from `project_brdf` with domain="sphere"; the others, `mask` too, and what is returned as in
     `shade_environment`.
     Derivatives: in every floating argument, both modes; the first exact for views along the normal as well, second ones
     not there. The cut at the horizon is a discontinuity of the view, with no gradient.
@@ -215,7 +217,7 @@ def shade_matrix(
         raise ValueError("`matrix` was fitted above the horizon only; project the material with domain='sphere'.")
     e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
     light = [("light_coefficients", e.shape[:-1])]
-    matrix, points, colour = surface("matrix", matrix, tangents, light, [e.dtype], normals=normals, views=views)
+    matrix, points, colour = surface("matrix", matrix, tangents, light, [e.dtype], mask, normals=normals, views=views)
     e = e[..., : (min(light_degree, matrix.degree) + 1) ** 2].astype(matrix.blocks[0].dtype)
     return by_device(shade_points, points, _shade, matrix, e, colour)
 

@@ -25,7 +25,7 @@ from shisd._typing import Array, Float
 from shisd.harmonics import _sh, _tables, _transform, project_map, sample_map, synthesize_map
 from shisd.harmonics._pairing import pair_many, rows, turned_series
 from shisd.shading._footprint import MirrorFootprint
-from shisd.shading._surface import frame, in_tiles, shade_points
+from shisd.shading._surface import as_type, finite_mark, finite_or_nan, frame, in_tiles, masks, shade_points
 
 _NUMBERS_AT_ONCE = 1 << 18  # coefficients of footprints in a tile
 
@@ -33,13 +33,18 @@ Points = dict[str, Float[Array, "p 3"]]
 
 
 def shade_mirror(
-    footprint: MirrorFootprint, light_coefficients: ArrayLike, *, anisotropic: bool = False
+    footprint: MirrorFootprint,
+    light_coefficients: ArrayLike,
+    *,
+    anisotropic: bool = False,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance of perfect mirrors under distant light, filtered over the footprint of each pixel.
 
     Arguments: `footprint` [...]; `light_coefficients` [*colour, n], SH coefficients in world space; static
     `anisotropic`: the Gaussian as it is, or a round one of the same mean variance (option 3 of ISD15 section 6.2, its
-    choice; the other is option 1). Returns [..., *colour], in the light's unit. NaN in a footprint gives NaN.
+    choice; the other is option 1); `mask` [...] as in `shade_environment`. Returns [..., *colour], in the light's unit.
+    NaN in a footprint gives NaN, with NaN gradients.
     Derivatives: in every floating argument, both modes, also where the footprint is round or a point. Those of second
     order are NaN at mirror directions along the z axis.
     Accuracy: against a Gaussian carried to the sphere, relative to the light, 0.06 of its variance, anisotropic 0.15,
@@ -51,10 +56,10 @@ def shade_mirror(
     Memory: one tile of at most 512 pixels, and the result.
     Source: ISD15 Eq. 28, 22 and 29.
     """
-    points, dtype = _points(footprint)
+    points, dtype = _points(footprint, mask)
     e, _ = _checks.expansion("light_coefficients", light_coefficients)
     dtype = jnp.promote_types(dtype, e.dtype)
-    points, e = jax.tree.map(lambda a: a.astype(dtype), (points, e))
+    points, e = as_type((points, e), dtype)
     return by_device(shade_points, points, _anisotropic if anisotropic else _isotropic, e)
 
 
@@ -89,37 +94,46 @@ def prefilter_mirror(texels: ArrayLike, *, levels: int = 13, degree: int | None 
     return MirrorMaps(maps, jnp.asarray(variances, maps.dtype), texels.shape[2:])
 
 
-def shade_prefiltered_mirror(footprint: MirrorFootprint, maps: MirrorMaps) -> Float[Array, "*batch_colour"]:
+def shade_prefiltered_mirror(
+    footprint: MirrorFootprint, maps: MirrorMaps, *, mask: ArrayLike | None = None
+) -> Float[Array, "*batch_colour"]:
     """Radiance of perfect mirrors under a filtered map: 13 lookups for each pixel, whatever the footprint and degree.
 
     The footprint is a sum of round Gaussians of variance det C / tau, near that of its narrow side, about directions
     that are displaced by C z / sqrt(tau), whose covariance C^2 / tau is the rest of C. The z are those of a rule of
     degree 5 for Gaussians in space: the centre and the vertices of an icosahedron.
-    Arguments: `footprint` [...]; `maps` from `prefilter_mirror`. Returns [..., *colour].
+    Arguments: `footprint` [...]; `maps` from `prefilter_mirror`; `mask` [...] as in `shade_environment`. Returns
+    [..., *colour]. NaN in a footprint gives NaN, with NaN gradients.
     Derivatives: in all, both modes, also where the footprint is round or a point; those in directions jump between
     texels, as in `harmonics.sample_map`, and those in variances between levels.
     Accuracy: that of the lookups, and of the rule: 0.4 % of the light for a C of four to one, 7 % for sixteen, 17 % for
     a hundred to one. A narrow side wider than 1 rad is cut to that.
     Source: ISD15 Eq. 17 and 28, option 2 of section 6.2.
     """
-    points, dtype = _points(footprint)
+    points, dtype = _points(footprint, mask)
     if not isinstance(maps, MirrorMaps):
         raise ValueError(f"`maps` must come from shading.prefilter_mirror; got {type(maps).__name__}.")
     dtype = jnp.promote_types(dtype, maps.texels.dtype)
-    points, maps = jax.tree.map(lambda a: a.astype(dtype), (points, maps))
+    points, maps = as_type((points, maps), dtype)
     return by_device(shade_points, points, _from_maps, maps)
 
 
 # ---- light as coefficients
 
 
-def _points(footprint: object) -> tuple[dict[str, Array], jnp.dtype]:
+def _points(footprint: object, mask: ArrayLike | None) -> tuple[dict[str, Array], jnp.dtype]:
     if not isinstance(footprint, MirrorFootprint):
         raise ValueError(f"`footprint` must come from shading.mirror_footprint; got {type(footprint).__name__}.")
     d, axes = _checks.vectors("footprint.directions", footprint.directions), footprint.axes
     if axes.shape != (*d.shape, 2):
         raise ValueError(f"`footprint.axes` must have shape {[*d.shape, 2]}; got {list(axes.shape)}.")
-    return {"directions": d, "along_columns": axes[..., 0], "along_rows": axes[..., 1]}, jnp.result_type(d, axes)
+    points, masked = {"directions": d, "along_columns": axes[..., 0], "along_rows": axes[..., 1]}, masks(mask)
+    try:
+        np.broadcast_shapes(*(a.shape for a in (points | masked).values()))
+    except ValueError as error:
+        shapes = f"`mask` {list(masked['mask'].shape[:-1])} and `footprint.directions` {list(d.shape)}"
+        raise ValueError(f"{shapes} do not broadcast.") from error
+    return points | masked, jnp.result_type(d, axes)
 
 
 def _half_eigenvalues(degree: int) -> np.ndarray:
@@ -131,12 +145,13 @@ def _half_eigenvalues(degree: int) -> np.ndarray:
 @eqx.filter_jit
 def _isotropic(points: Points, e: Float[Array, "*colour n"]) -> Float[Array, " p *colour"]:
     degree = _checks.degree_of(e.shape[-1])
-    half = jnp.asarray(_half_eigenvalues(degree)[:, None], e.dtype)
+    half, shared = jnp.asarray(_half_eigenvalues(degree)[:, None], e.dtype), finite_mark(e)
 
     def shade(tile: Points) -> Float[Array, " p *colour"]:
         variance = jnp.sum(tile["along_columns"] ** 2 + tile["along_rows"] ** 2, axis=1) / 2
-        values = _filtered(e.reshape(-1, e.shape[-1]), normalize(tile["directions"]), jnp.exp(-half * variance[None]))
-        return values.T.reshape(-1, *e.shape[:-1])
+        u = normalize(tile["directions"])
+        values = _filtered(e.reshape(-1, e.shape[-1]), u, jnp.exp(-half * variance[None]))
+        return finite_or_nan(values.T.reshape(-1, *e.shape[:-1]), [u, *tile.values()], shared)
 
     size = (1 << 15) // (degree // 2 + 1) ** 2  # larger tiles leave the cache
     return in_tiles(shade, points, min(512, max(128, size)))
@@ -204,14 +219,14 @@ def _by_parity(e: Float[Array, "f n"], degree: int) -> Float[Array, "2 2 h a i"]
 @eqx.filter_jit
 def _anisotropic(points: Points, e: Float[Array, "*colour n"]) -> Float[Array, " p *colour"]:
     degree = _checks.degree_of(e.shape[-1])
-    series = turned_series(e.reshape(-1, e.shape[-1]), degree)
+    series, shared = turned_series(e.reshape(-1, e.shape[-1]), degree), finite_mark(e)
 
     def shade(tile: Points) -> Float[Array, " p *colour"]:
         r = frame(normalize(tile["directions"]))
         a, b = (jnp.einsum("pi,pij->jp", tile[name], r) for name in ("along_columns", "along_rows"))
         plus, minus = _gaussian(a[0] ** 2 + b[0] ** 2, a[0] * a[1] + b[0] * b[1], a[1] ** 2 + b[1] ** 2, degree)
         values = pair_many(plus[:, None], minus[:, None], series, jnp.swapaxes(r, 1, 2), degree, True)
-        return values.T.reshape(-1, *e.shape[:-1])
+        return finite_or_nan(values.T.reshape(-1, *e.shape[:-1]), [r, *tile.values()], shared)
 
     return in_tiles(shade, points, min(512, max(64, _NUMBERS_AT_ONCE // e.shape[-1])))
 
@@ -275,7 +290,7 @@ def _from_maps(points: Points, maps: MirrorMaps) -> Float[Array, " p *colour"]:
     height, width, levels, colours = maps.texels.shape
     weights, z = (jnp.asarray(a, maps.texels.dtype) for a in _icosahedron())
     lower, upper = maps.variances[:-1, None], maps.variances[1:, None]
-    texels = maps.texels.reshape(height, width, -1)
+    texels, shared = maps.texels.reshape(height, width, -1), finite_mark(maps.texels)
 
     def shade(tile: Points) -> Float[Array, " p *colour"]:
         u, axes = normalize(tile["directions"]), jnp.stack([tile["along_columns"], tile["along_rows"]], axis=2)
@@ -292,6 +307,6 @@ def _from_maps(points: Points, maps: MirrorMaps) -> Float[Array, " p *colour"]:
         share = jnp.clip(((det / safe)[None] - lower) / (upper - lower), 0, 1)  # of the upper of two levels
         ends = jnp.pad(share, ((1, 1), (0, 0)), constant_values=((1, 0), (0, 0)))
         values = jnp.einsum("z,zplc,lp->pc", weights, looked, ends[:-1] - ends[1:])
-        return values.reshape(-1, *maps.colour)
+        return finite_or_nan(values.reshape(-1, *maps.colour), [u, *tile.values()], shared)
 
     return in_tiles(shade, points, 1024)

@@ -10,6 +10,7 @@ b . M c, and M^T b are the coefficients of the light that comes through the outl
 only they are turned to the local frame.
 """
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -30,14 +31,26 @@ from shisd.domains._polygon import clip, loop_solid_angle, on_sphere
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
 from shisd.models import PolygonLight, PortalLight
-from shisd.models._light import lobe_product
+from shisd.models._light import product_matrices
 from shisd.shading._incidence import incidence_integrals
 from shisd.shading._lobes import Lobes, check_lobes, lookup_factors, lookup_table, slice_values
-from shisd.shading._surface import in_tiles, local_lights, shade_points, shade_tiles, surface
+from shisd.shading._surface import (
+    finite_mark,
+    finite_or_nan,
+    in_tiles,
+    local_lights,
+    masks,
+    shade_points,
+    shade_tiles,
+    stacked,
+    sum_lights,
+    surface,
+)
 
 Light = PolygonLight | PortalLight
 _TILE = 2048  # pixels at a time
 _SMALL_TILE = 128  # where every pixel holds the moments about all axes
+_Y_00 = math.sqrt(1 / (4 * math.pi))
 
 
 def shade_polygon(
@@ -47,14 +60,16 @@ def shade_polygon(
     normals: ArrayLike,
     views: ArrayLike,
     tangents: ArrayLike | None = None,
+    *,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer, lit by polygons, without occlusion (CSH18 Eq. 12).
 
     Arguments: `lobes` from `tabulate_brdf`, best with domain="upper"; `light`, one or several; `positions` [..., 3] in
-    world space; `normals`, `views` and, for anisotropic materials, `tangents` [..., 3], as in `shade_environment`.
-    Returns [..., *colour] in the unit of the emission. What lies below the horizon of a point is cut off; a light
-    wholly below it, seen from behind, or whose plane holds the point, adds 0, with gradient 0. A view below the horizon
-    gives 0.
+    world space; `normals`, `views` and, for anisotropic materials, `tangents` [..., 3], and `mask`, as in
+    `shade_environment`. Returns [..., *colour] in the unit of the emission. What lies below the horizon of a point is
+    cut off; a light wholly below it, seen from behind, or whose plane holds the point, adds 0, with gradient 0. A view
+    that is not above the horizon gives 0. A NaN anywhere, or a zero normal or view, gives NaN, with NaN gradients.
     Derivatives: in every floating argument: positions, outline and emission of the lights, material, frame; the first
     exact for views along the normal as well, second ones not there.
     Accuracy: exact for the tabulated slice, to 1e-12 in float64 and 3e-5 of the largest radiance in float32. Against
@@ -62,9 +77,10 @@ def shade_polygon(
     for GGX of alpha 0.5.
     Cost: moments at L+1 axes, 2L+1 for anisotropic materials, for every pixel, light and colour of the material; half
     as many edges again where the horizon cuts a light in any of 2048 pixels that follow each other, nothing where it is
-    dark in all; of lights with a profile, that of `shade_portal`. Memory: one tile of 2048 pixels.
+    dark in all; of lights with a profile, that of `shade_portal`. Lights of equal shapes (corners, colours, profile)
+    are one piece of compiled code, whatever their number. Memory: one tile of 2048 pixels, of each light for gradients.
     """
-    return _shade_lights(lobes, light, PolygonLight, "light", positions, normals, views, tangents)
+    return _shade_lights(lobes, light, PolygonLight, "light", positions, normals, views, tangents, mask)
 
 
 def shade_portal(
@@ -74,27 +90,31 @@ def shade_portal(
     normals: ArrayLike,
     views: ArrayLike,
     tangents: ArrayLike | None = None,
+    *,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer, lit by distant light through windows (CSH18 Eq. 13).
 
-    Arguments: `portal`, one or several, each of at least the lobes' degree; the others and what is returned as in
-    `shade_polygon`, in the unit of the distant light.
+    Arguments: `portal`, one or several; the others and what is returned as in `shade_polygon`, in the unit of the
+    distant light.
     Derivatives: in every floating argument: positions, outline and distant light of the portals, material, frame.
     Accuracy: exact for the tabulated slice and the expansion of the distant light, to 1e-12 in float64 and 3e-5 of the
     largest radiance in float32.
     Cost: for every pixel and portal, moments to degree Le + L at twice as many axes (CSH18 Eq. 14 needs all bands of
-    the product), and for each colour a product with a matrix [(L+1)^2, (Le+L+1)^2].
+    the product), and for each colour a product with a matrix [(L+1)^2, (Le+L+1)^2], which is made once in every call.
     """
-    return _shade_lights(lobes, portal, PortalLight, "portal", positions, normals, views, tangents)
+    return _shade_lights(lobes, portal, PortalLight, "portal", positions, normals, views, tangents, mask)
 
 
-def project_light(light: Light, positions: ArrayLike, basis: int | HaarBasis) -> Float[Array, "*batch_colour_n"]:
+def project_light(
+    light: Light, positions: ArrayLike, basis: int | HaarBasis, *, mask: ArrayLike | None = None
+) -> Float[Array, "*batch_colour_n"]:
     """Coefficients of the radiance that a light sends to points, for precomputed transfer (CSH18 section 6.1).
 
     Arguments: a `PolygonLight` or `PortalLight`; `positions` [..., 3] in world space; static `basis`, the degree of
-    spherical harmonics or a `domains.HaarBasis`.
+    spherical harmonics or a `domains.HaarBasis`; `mask` [...] as in `shade_environment`.
     Returns [..., *colour, n], the function of direction in world space, without a horizon: zero outside the outline,
-    and everywhere for a point behind the light.
+    and everywhere for a point behind the light. A NaN anywhere gives NaN, with NaN gradients.
     Derivatives: in positions and all that the light is made of.
     Accuracy: exact; 1e-11 of the largest coefficient in float64 and 1e-4 in float32.
     Cost: moments to the degree of the basis plus that of the light; for Haar wavelets, in every cell.
@@ -103,12 +123,10 @@ def project_light(light: Light, positions: ArrayLike, basis: int | HaarBasis) ->
         raise ValueError(f"`light` must be a models.PolygonLight or PortalLight; got {type(light).__name__}.")
     if not isinstance(basis, HaarBasis):
         basis = _checks.integer("basis", basis)
-        if isinstance(light, PortalLight) and light.degree < basis:
-            raise ValueError(f"`light` was made for degree {light.degree}; pass PortalLight(..., degree={basis}).")
     p = _checks.vectors("positions", positions)
     dtype = jnp.promote_types(p.dtype, light.points.dtype)
     light = jax.tree.map(lambda x: x.astype(dtype), light)
-    return by_device(shade_points, {"positions": p.astype(dtype)}, _project, light, basis)
+    return by_device(shade_points, {"positions": p.astype(dtype)} | masks(mask), _project, light, basis)
 
 
 def _shade_lights(
@@ -120,17 +138,14 @@ def _shade_lights(
     normals: ArrayLike,
     views: ArrayLike,
     tangents: ArrayLike | None,
+    mask: ArrayLike | None,
 ) -> Float[Array, "*batch_colour"]:
     check_lobes(lobes, everywhere=False)
     lights = local_lights(name, light, kind)
-    for x in lights:
-        if isinstance(x, PortalLight) and x.degree < lobes.degree:
-            raise ValueError(
-                f"`portal` was made for lobes of degree {x.degree}; pass PortalLight(..., degree={lobes.degree})."
-            )
     colours = [(f"{name} {i}", x.colour) for i, x in enumerate(lights)]
     vectors = {"positions": positions, "normals": normals, "views": views}
-    lobes, points, colour = surface("lobes", lobes, tangents, colours, [x.points.dtype for x in lights], **vectors)
+    dtypes = [x.points.dtype for x in lights]
+    lobes, points, colour = surface("lobes", lobes, tangents, colours, dtypes, mask, **vectors)
     lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
     return by_device(shade_points, points, _shade, lobes, lights, colour)
 
@@ -140,13 +155,15 @@ def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[Light, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     table = lookup_table(lobes)
-    products = [_product(light, lobes.degree) for light in lights]
+    stacks = [(stack, _products(stack, lobes.degree)) for stack in stacked(lights)]
 
     def radiance(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
     ) -> Float[Array, "*colour p"]:
-        total = jnp.zeros((*colour, positions.shape[0]), table.dtype)
-        for light, product in zip(lights, products, strict=True):
+        zero = jnp.zeros((*colour, positions.shape[0]), table.dtype)
+
+        def of_light(one: tuple[Light, Array | None]) -> Float[Array, "*colour p"]:
+            light, product = one
             relative = light.points.T[:, :, None] - positions.T[:, None]
             above = dot(frame[:, :, 2].T[:, None], relative)
             sign = jnp.where(jnp.max(above, axis=0) > 0, _facing(light, relative), 0)
@@ -155,11 +172,12 @@ def _shade(
                 lit = times(_uniform(lobes, table, local, outline, above, sign), _constant_radiance(light))
             else:
                 lit = _directional(lobes, table, frame, local, outline, product)
-            total += jnp.broadcast_to(times(lit, sign), total.shape)
-        return total
+            return jnp.broadcast_to(times(lit, sign), zero.shape)
 
-    size = _TILE if all(product is None for product in products) else _SMALL_TILE
-    return shade_tiles(lobes, points, colour, size, radiance)
+        return sum_lights(of_light, stacks, zero)
+
+    size = _TILE if all(product is None for _, product in stacks) else _SMALL_TILE
+    return shade_tiles(lobes, points, colour, size, radiance, lights)
 
 
 def _uniform(lobes: Lobes, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:
@@ -173,13 +191,15 @@ def _uniform(lobes: Lobes, table: Array, local: Array, outline: Loop, above: Arr
         v = on_sphere(jax.lax.cond(all_whole, whole, lambda: clip(outline, above)))
         angle = loop_solid_angle(v, 2 * np.pi, _up(v))
         if lobes.isotropic:
-            constant, tables = table[..., 0, :] @ lookup_factors(local, lobes), table.reshape(-1, *table.shape[-2:])
-            rest = [incidence_integrals(t, local, v, lobes.degree, spare) for t in tables]
+            constant, of_colours = table[..., 0, :] @ lookup_factors(local, lobes), table
+            of_one = lambda t: incidence_integrals(t, local, v, lobes.degree, spare)
         else:
-            c = slice_values(table, local, lobes)
-            constant, inverse = c[..., 0, :], zonal_inverse(lobes.degree, c.dtype)
-            rest = [fold_expansion(x, v, *inverse, spare) for x in c.reshape(-1, *c.shape[-2:])]
-        return times(constant, angle * np.sqrt(1 / (4 * np.pi))) + jnp.stack(rest).reshape(constant.shape)
+            of_colours = slice_values(table, local, lobes)
+            constant, inverse = of_colours[..., 0, :], zonal_inverse(lobes.degree, table.dtype)
+            of_one = lambda c: fold_expansion(c, v, *inverse, spare)
+        # colours in a loop: compiled code would grow with their number
+        rest = jax.lax.map(of_one, of_colours) if lobes.colour else of_one(of_colours)
+        return times(constant, angle * _Y_00) + rest
 
     nothing = lambda: jnp.zeros((*lobes.colour, len(local)), table.dtype)
     return jax.lax.cond(jnp.all(dark), nothing, integrals)
@@ -202,7 +222,7 @@ def _directional(
 def _project(
     points: dict[str, Float[Array, "p 3"]], light: Light, basis: int | HaarBasis
 ) -> Float[Array, " p *colour_n"]:
-    incident = incident_radiance(light)
+    incident, shared = incident_radiance(light), finite_mark(light)
     product = None if isinstance(basis, HaarBasis) else _product(light, basis)
 
     def project(tile: dict[str, Array]) -> Float[Array, " p *colour_n"]:
@@ -219,15 +239,19 @@ def _project(
             c = times(loop_coefficients(v, angle, basis), _constant_radiance(light)[..., None])
         else:
             c = _through(product, v, angle)
-        return jnp.moveaxis(times(c, sign), -1, 0)
+        return finite_or_nan(jnp.moveaxis(times(c, sign), -1, 0), tile.values(), shared)
 
     size = 1 + 2048 // basis.size if isinstance(basis, HaarBasis) else _SMALL_TILE
     return in_tiles(project, points, size)
 
 
 def _facing(light: Light, relative: Loop) -> Float[Array, " p"]:
-    """-1 in front of a light, where its outline runs clockwise as seen from outside the sphere; 0 or 1 behind it."""
-    outwards = jnp.cross(light.points, jnp.roll(light.points, -1, 0)).sum(axis=0)
+    """-1 in front of a light, where its outline runs clockwise as seen from outside the sphere; 0 or 1 behind it.
+
+    Its plane is that of differences to a vertex, which keep their digits far from the origin.
+    """
+    edges = light.points - light.points[:1]
+    outwards = jnp.cross(edges, jnp.roll(edges, -1, 0)).sum(axis=0)
     side = jnp.sign(outwards @ relative[:, 0])
     return side if light.two_sided else jnp.minimum(side, 0)
 
@@ -246,24 +270,24 @@ def incident_radiance(light: Light) -> Float[Array, "*colour_n"]:
     if isinstance(light, PortalLight):
         return light.coefficients
     if light.profile is None:
-        return light.emission[..., None] * np.sqrt(4 * np.pi)
+        return light.emission[..., None] / _Y_00
     parity = (-1.0) ** _tables.bands(_checks.degree_of(light.profile.shape[-1]))
     return times(times(light.profile, jnp.asarray(parity, light.profile.dtype)), light.emission[..., None])
 
 
 def _constant_radiance(light: Light) -> Float[Array, "*colour 1"]:
-    return incident_radiance(light) * np.sqrt(1 / (4 * np.pi))
+    return incident_radiance(light) * _Y_00
+
+
+def _products(stack: Light, degree: int) -> Float[Array, " lights *colour_n_m"] | None:
+    return jax.lax.map(lambda light: _product(light, degree), stack)
 
 
 def _product(light: Light, degree: int) -> Float[Array, "*colour_n_m"] | None:
     """From coefficients of a slice to those of slice times light; None where light is constant."""
     incident = incident_radiance(light)
     light_degree = _checks.degree_of(incident.shape[-1])
-    if light_degree == 0:
-        return None
-    if isinstance(light, PortalLight):
-        return light.product[..., : (light_degree + degree + 1) ** 2, : (degree + 1) ** 2]
-    return lobe_product(incident, degree)
+    return None if light_degree == 0 else product_matrices(incident, light_degree + degree, degree)
 
 
 def _through(product: Float[Array, "*colour_n_m"], v: Loop, solid_angle: Array) -> Float[Array, "*c n p"]:

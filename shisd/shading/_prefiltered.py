@@ -34,7 +34,7 @@ from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import _tables
 from shisd.shading import _views
 from shisd.shading._lobes import Lobes, check_lobes
-from shisd.shading._surface import in_tiles, shade_points
+from shisd.shading._surface import as_type, finite_mark, finite_or_nan, in_tiles, masks, shade_points
 
 _TILE, _NUMBERS_AT_ONCE = 1 << 14, 1 << 21  # pixels, and values of all channels for them, at a time
 DARK = 1e-12  # of the brightest colour's mean square: what is below is rounding
@@ -109,18 +109,18 @@ def prefilter(
         like = _choose(*values, tolerance)
     elif not isinstance(like, PrefilteredLobes) or like.degree != degree:
         raise ValueError(f"`like` must come from shading.prefilter at degree {degree}.")
-    like = jax.lax.stop_gradient(_as_type(like, dtype))
+    like = jax.lax.stop_gradient(as_type(like, dtype))
     tables = _filter(c, e.reshape(-1, e.shape[-1]), like, jnp.asarray(_swaps(degree), dtype))
     return dataclasses.replace(like, **tables, colours=(lobes.colour, e.shape[:-1]))
 
 
 def shade_prefiltered(
-    prefiltered: PrefilteredLobes, normals: ArrayLike, views: ArrayLike
+    prefiltered: PrefilteredLobes, normals: ArrayLike, views: ArrayLike, *, mask: ArrayLike | None = None
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under the light of `prefilter`.
 
-    Arguments: `normals` and `views` as in `shade_environment`. Returns [..., *colour]. A view below the horizon gives
-    0; a zero or NaN normal or view gives NaN.
+    Arguments: `normals`, `views` and `mask` as in `shade_environment`. Returns [..., *colour]. A view that is not above
+    the horizon gives 0; a zero or NaN normal or view gives NaN.
     Derivatives: in normals, views and tables, both modes; twice continuous in directions, where the chart changes up to
     the error of the splines.
     Accuracy: that of `prefilter`, and 1e-3 of the highest bands, whatever the degree.
@@ -129,18 +129,15 @@ def shade_prefiltered(
     if not isinstance(prefiltered, PrefilteredLobes):
         raise ValueError(f"`prefiltered` must come from shading.prefilter; got {type(prefiltered).__name__}.")
     points = {"normals": _checks.vectors("normals", normals), "views": _checks.vectors("views", views)}
+    masked = masks(mask)
     try:
-        np.broadcast_shapes(*(x.shape for x in points.values()))
+        np.broadcast_shapes(*(x.shape for x in (points | masked).values()))
     except ValueError as error:
-        shapes = " and ".join(f"`{name}` {list(x.shape)}" for name, x in points.items())
+        shapes = " and ".join(f"`{name}` {list(x.shape)}" for name, x in (points | masked).items())
         raise ValueError(f"{shapes} do not broadcast.") from error
     dtype = jnp.result_type(prefiltered.maps, *points.values())
-    points = {name: x.astype(dtype) for name, x in points.items()}
-    return by_device(shade_points, points, _shade, _as_type(prefiltered, dtype))
-
-
-def _as_type(prefiltered: PrefilteredLobes, dtype: jnp.dtype) -> PrefilteredLobes:
-    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, prefiltered)
+    points = {name: x.astype(dtype) for name, x in points.items()} | masked
+    return by_device(shade_points, points, _shade, as_type(prefiltered, dtype))
 
 
 # ---- choice of channels, on the host
@@ -346,6 +343,7 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
     material, light = (int(np.prod(c)) for c in lobes.colours)
     rows, first, kept = _grid(lobes.degree)
     width, count = 2 * rows + 4, len(lobes.order)
+    shared = finite_mark(lobes.maps, lobes.profiles)
     # indexed copies and jnp.sum would be slow: both are products
     k = np.arange(lobes.highest + 1, dtype=np.int32)[:, None]
     choose = jnp.concatenate([k == lobes.order[None], -k == lobes.order[None]]).astype(lobes.maps.dtype)
@@ -382,7 +380,7 @@ def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> F
         waves = jnp.concatenate([cos, sin]).T @ choose
         terms = waves[..., None] * a * looked.reshape(-1, count, light)
         total = terms.reshape(-1, count * terms.shape[-1]) @ sums
-        total = jnp.where((cosine < 0)[:, None], 0, total)
+        total = finite_or_nan(jnp.where((cosine > 0)[:, None], total, 0), [n, v], shared)
         return total.reshape(-1, *np.broadcast_shapes(*lobes.colours))
 
     return in_tiles(shade, points, min(_TILE, max(1, _NUMBERS_AT_ONCE // lobes.maps.shape[1])))

@@ -21,7 +21,7 @@ from shisd.domains._region import cap_coefficients
 from shisd.models import SphereLight
 from shisd.models._light import versine
 from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
-from shisd.shading._surface import local_lights, shade_points, shade_tiles, surface
+from shisd.shading._surface import local_lights, shade_points, shade_tiles, stacked, sum_lights, surface
 
 
 def shade_sphere(
@@ -31,13 +31,15 @@ def shade_sphere(
     normals: ArrayLike,
     views: ArrayLike,
     tangents: ArrayLike | None = None,
+    *,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer, lit by balls, without occlusion (ISD15 Eq. 34).
 
     Arguments: `lobes` from `tabulate_brdf`, with domain="sphere"; `light`, one or several; `positions` [..., 3] in
-    world space; the others and what is returned as in `shade_environment`, in the unit of the emission. What lies
-    below the horizon of a point adds nothing, as far as the lobes' degree resolves the cosine's edge. A point inside a
-    ball has its surface all around; a `radius` that is zero or negative gives NaN.
+    world space; the others, `mask` too, and what is returned as in `shade_environment`, in the unit of the emission.
+    What lies below the horizon of a point adds nothing, as far as the lobes' degree resolves the cosine's edge. A point
+    inside a ball has its surface all around; a `radius` that is zero or negative gives NaN.
     Derivatives: in every floating argument: position, radius and emission of the lights, positions, material, frame;
     both modes, any order, where the view or a ball lie along the normal the first. Those in position and radius go to
     infinity at the surface of a ball.
@@ -48,7 +50,8 @@ def shade_sphere(
     lights = local_lights("light", light, SphereLight)
     colours = [(f"light {i}", x.colour) for i, x in enumerate(lights)]
     vectors = {"positions": positions, "normals": normals, "views": views}
-    lobes, points, colour = surface("lobes", lobes, tangents, colours, [x.center.dtype for x in lights], **vectors)
+    dtypes = [x.center.dtype for x in lights]
+    lobes, points, colour = surface("lobes", lobes, tangents, colours, dtypes, mask, **vectors)
     lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
     return by_device(shade_points, points, _shade, lobes, lights, colour)
 
@@ -57,20 +60,22 @@ def shade_sphere(
 def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[SphereLight, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    table = lookup_table(lobes)
+    table, stacks = lookup_table(lobes), stacked(lights)
 
     def radiance(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
     ) -> Float[Array, "*colour p"]:
         slices = slice_values(table, local, lobes)
-        total = jnp.zeros((*colour, len(local)), slices.dtype)
-        for light in lights:
+        zero = jnp.zeros((*colour, len(local)), slices.dtype)
+
+        def of_light(light: SphereLight) -> Float[Array, "*colour p"]:
             to_center = light.center[None] - positions
-            t = jnp.where(light.radius > 0, versine(light, jnp.sum(to_center**2, axis=1)), jnp.nan)
+            t = versine(light, jnp.sum(to_center**2, axis=1))
             inside = (t >= 2)[:, None]  # then any axis will do
             a = jnp.einsum("pij,pi->pj", frame, jnp.where(inside, frame[:, :, 2], to_center))
             lit = jnp.sum(times(slices, cap_coefficients(t, a, lobes.degree).T), axis=-2)
-            total += jnp.broadcast_to(times(lit, light.emission[..., None]), total.shape)
-        return total
+            return jnp.broadcast_to(times(lit, light.emission[..., None]), zero.shape)
 
-    return shade_tiles(lobes, points, colour, 1024, radiance)
+        return sum_lights(of_light, stacks, zero)
+
+    return shade_tiles(lobes, points, colour, 1024, radiance, lights)

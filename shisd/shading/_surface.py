@@ -1,5 +1,11 @@
-"""Surface points, as every shading verb takes them: their checks, their frames, and one tile of them after another."""
+"""Surface points, as every shading verb takes them: their checks, their frames, and one tile of them after another.
 
+What depends on the number of points is compiled again for every new one. So a batch is filled up to one of few sizes,
+with copies of its last point, before it meets the code that takes long to compile.
+"""
+
+import functools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -26,8 +32,12 @@ class Surface(Protocol):
 
 
 Material = TypeVar("Material", bound=Surface)
+Light = TypeVar("Light")
+Pytree = TypeVar("Pytree")
 _DIRECTIONS = ("normals", "views", "tangents")
 _LANES = 64  # a tile is a multiple of this many points
+_ELSEWHERE = np.array([0.3217, 0.2741, 0.9063])  # a point and a direction, in place of what is masked
+_PARALLEL = 100  # eps, sine of the angle between tangent and normal below which two digits of the frame are not left
 
 
 def surface(
@@ -36,29 +46,45 @@ def surface(
     tangents: ArrayLike | None,
     light: Iterable[tuple[str, Shape]],
     dtypes: Iterable[DTypeLike],
+    mask: ArrayLike | None,
     **vectors: ArrayLike,
 ) -> tuple[Material, dict[str, Array], Shape]:
     """The material and arrays [..., 3] in the common dtype, and the colour of material and `light` together.
 
     `name` is that of the material's argument, `tangents` are taken where it needs them, `light` names the colour axes
-    of each light.
+    of each light. Where there is a `mask`, it is among the arrays.
     """
     if not material.isotropic:
         if tangents is None:
             raise ValueError("`tangents` [..., 3] are needed: this material is anisotropic.")
         vectors["tangents"] = tangents
     arrays = {key: _checks.vectors(key, value) for key, value in vectors.items()}
+    masked = masks(mask)
     colours = [(name, material.colour), *light]
     try:
-        np.broadcast_shapes(*(a.shape for a in arrays.values()))
+        np.broadcast_shapes(*(a.shape for a in (arrays | masked).values()))
         colour = np.broadcast_shapes(*(c for _, c in colours))
     except ValueError as error:
-        shapes = {key: list(a.shape) for key, a in arrays.items()}
+        shapes = {key: list(a.shape) for key, a in (arrays | masked).items()}
         named = " and ".join(f"`{key}` {list(c)}" for key, c in colours)
         raise ValueError(f"batch axes {shapes}, or colours of {named}, do not broadcast.") from error
     dtype = jnp.result_type(*jax.tree.leaves(material), *dtypes, *arrays.values())
-    cast = lambda x: x.astype(dtype)
-    return jax.tree.map(cast, material), jax.tree.map(cast, arrays), colour
+    return as_type(material, dtype), as_type(arrays, dtype) | masked, colour
+
+
+def as_type(tree: Pytree, dtype: DTypeLike) -> Pytree:
+    """The same with all floating arrays in this dtype."""
+    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+
+
+def masks(mask: ArrayLike | None) -> dict[str, Array]:
+    """The argument `mask` [...] as an array [..., 1] among those of points; none without one."""
+    if mask is None:
+        return {}
+    array = jnp.asarray(mask)
+    if array.dtype != bool:
+        raise ValueError(f"`mask` must be bool [...], True where there is a surface; got dtype {array.dtype}.")
+    return {"mask": array[..., None]}
 
 
 def local_lights(name: str, light: Any, kind: type) -> tuple:
@@ -69,12 +95,69 @@ def local_lights(name: str, light: Any, kind: type) -> tuple:
     return lights
 
 
+def stacked(lights: Iterable[Light]) -> list[Light]:
+    """Lights of one kind and of equal shapes as one, whose arrays have a first axis for them."""
+    kinds: dict[Any, list[Light]] = {}
+    for light in lights:
+        leaves, kind = jax.tree.flatten(light)
+        kinds.setdefault((kind, *(x.shape for x in leaves)), []).append(light)
+    return [jax.tree.map(lambda *x: jnp.stack(x), *group) for group in kinds.values()]
+
+
+def sum_lights(radiance: Callable[[Any], Array], stacks: Iterable[Any], total: Array) -> Array:
+    """`total` and radiance(light) of every light of stacks: the code of one light for each stack, in a loop."""
+    for stack in stacks:
+        if len(jax.tree.leaves(stack)[0]) == 1:
+            total += radiance(jax.tree.map(lambda x: x[0], stack))
+        else:
+            total = jax.lax.scan(lambda x, light: (x + radiance(light), None), total, stack)[0]
+    return total
+
+
 def shade_points(points: dict[str, Array], shade: Callable[..., Array], *arguments: Any) -> Array:
-    """`shade(points, *arguments)`, which takes flat points [p, k]; instead of p, the result has their batch axes."""
+    """`shade(points, *arguments)`, which takes flat points [p, k]; instead of p, the result has their batch axes.
+
+    Points where the array "mask" is False are replaced before anything is done with them; there the result is 0.
+    `shade` sees few values of p: powers of two up to 64, then eight to every doubling, at most an eighth too many.
+    """
     shape = np.broadcast_shapes(*(a.shape[:-1] for a in points.values()))
+    return _shaped(shade(_flat(points, shape), *arguments), points.get("mask"), shape)
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _flat(points: dict[str, Array], shape: Shape) -> dict[str, Array]:
     flat = {name: jnp.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for name, a in points.items()}
-    values = shade(flat, *arguments)
-    return values.reshape(*shape, *values.shape[1:])
+    count = math.prod(shape)
+    mask = flat.pop("mask", None)
+    if mask is not None and count > 0:
+        # a point that is there, so that lights, too, get no gradient but a finite one times zero
+        first = jnp.argmax(mask[:, 0])
+        other = {name: jnp.where(mask[first], a[first], _elsewhere(name, a)) for name, a in flat.items()}
+        flat = {name: jnp.where(mask, a, jax.lax.stop_gradient(other[name])[None]) for name, a in flat.items()}
+    more = _filled(count) - count
+    return {name: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]) for name, a in flat.items()}
+
+
+def _elsewhere(name: str, a: Array) -> Array:
+    """A row of an array of points, for batches in which all is masked."""
+    row = np.roll(_ELSEWHERE, name == "tangents") if a.shape[1] == 3 else np.zeros(a.shape[1])
+    return jnp.asarray(row, a.dtype)
+
+
+def _filled(count: int) -> int:
+    """The size that a batch is filled up to."""
+    octave = 1 << max(count - 1, 0).bit_length()
+    step = octave if octave <= _LANES else octave // 16
+    return -(-count // step) * step
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _shaped(values: Array, mask: Array | None, shape: Shape) -> Array:
+    colour = values.shape[1:]
+    values = values[: math.prod(shape)].reshape(*shape, *colour)
+    if mask is None:
+        return values
+    return jnp.where(jnp.broadcast_to(mask[..., 0], shape).reshape(*shape, *(1,) * len(colour)), values, 0)
 
 
 def shade_tiles(
@@ -83,12 +166,14 @@ def shade_tiles(
     colour: Shape,
     size: int,
     radiance: Callable[..., Float[Array, "*colour p"]],
+    light: Any,
 ) -> Float[Array, " p *colour"]:
-    """`radiance(frame, local, **others)` of all points, `size` at a time; 0 where the view is below the horizon.
+    """`radiance(frame, local, **others)` of all points, `size` at a time; 0 where no view is above the horizon.
 
     `frame` [p, 3, 3] is local to world, `local` [p, 3] is the view in it, and `others` are the `points` of the tile
-    that are not directions.
+    that are not directions. A point, material or `light` that is not finite gives NaN.
     """
+    shared = finite_mark(material, light)
 
     def shade_tile(tile: dict[str, Array]) -> Float[Array, " p *colour"]:
         directions = {name: normalize(a) for name, a in tile.items() if name in _DIRECTIONS}
@@ -97,7 +182,8 @@ def shade_tiles(
         r = frame(normal) if material.isotropic else tangent_frame(normal, directions["tangents"])
         local = jnp.einsum("pij,pi->pj", r, directions["views"])
         values = radiance(r, local, **others)
-        return jnp.where((local[:, 2] < 0).reshape(-1, *(1,) * len(colour)), 0, jnp.moveaxis(values, -1, 0))
+        seen = (local[:, 2] > 0).reshape(-1, *(1,) * len(colour))
+        return finite_or_nan(jnp.where(seen, jnp.moveaxis(values, -1, 0), 0), [r, local, *others.values()], shared)
 
     return in_tiles(shade_tile, points, size)
 
@@ -115,6 +201,22 @@ def in_tiles(function: Callable[[dict[str, Array]], Array], rows: dict[str, Arra
     fill = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]).reshape(tiles, size, -1)
     values = jax.lax.map(jax.checkpoint(function), {name: fill(a) for name, a in rows.items()})
     return values.reshape(tiles * size, *values.shape[2:])[:count]
+
+
+def finite_mark(*arrays: Any) -> Array:
+    """A sum of all floating numbers in these pytrees that is finite where all are, of next to no size."""
+    floating = [x for x in jax.tree.leaves(arrays) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return functools.reduce(jnp.add, [jnp.sum(x * jnp.finfo(x.dtype).tiny) for x in floating])
+
+
+def finite_or_nan(values: Float[Array, "p ..."], own: Iterable[Array], shared: Array) -> Float[Array, "p ..."]:
+    """`values`, but NaN, with NaN derivatives, where a point's `own` arrays [p, ...] or what all share is not finite.
+
+    `shared` is a `finite_mark`. Comparisons, on which choices depend, take NaN for "no": without this NaN becomes dark.
+    """
+    mark = jax.vmap(lambda own: finite_mark(own))(list(own)) + shared
+    none = jnp.where(jnp.isfinite(mark), 0, jnp.nan) * mark
+    return values + none.reshape(-1, *(1,) * (values.ndim - 1))
 
 
 @jax.custom_jvp
@@ -140,6 +242,8 @@ def _frame_jvp(primals, tangents):
 
 
 def tangent_frame(normal: Float[Array, "p 3"], tangent: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
-    """R = (t, b, n), t along the part of the tangent that is orthogonal to n."""
-    t = normalize(tangent - jnp.sum(normal * tangent, axis=-1, keepdims=True) * normal)
+    """R = (t, b, n), t along the part of the unit tangent that is orthogonal to n; NaN where only rounding is left."""
+    t = tangent - jnp.sum(normal * tangent, axis=-1, keepdims=True) * normal
+    parallel = jnp.sum(t * t, axis=-1, keepdims=True) <= (_PARALLEL * jnp.finfo(t.dtype).eps) ** 2
+    t = normalize(jnp.where(parallel, jnp.nan, 1) * t)
     return jnp.stack([t, jnp.cross(normal, t), normal], axis=-1)

@@ -43,12 +43,14 @@ def shade_environment_visibility(
     *,
     triangle: ArrayLike | None = None,
     weights: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under distant light, with occlusion (ISD15 Eq. 25).
 
     Arguments: `visibility` is a `models.Visibility`, with the `triangle` [...] that each point lies in and its
     barycentric `weights` [..., 3] there; or SH coefficients [n], one visibility for all points, as
-    `models.cap_visibility` gives them; or [..., n] for each. The others and what is returned as in `shade_environment`.
+    `models.cap_visibility` gives them; or [..., n] for each. The others, `mask` too, and what is returned as in
+    `shade_environment`.
     Light, visibility and lobes may have any degrees: what is integrated is the product of the three expansions, exact
     with all bands of the light up to the sum of the degrees of visibility and lobes.
     Derivatives: in every floating argument: material, light, visibility, weights, frame.
@@ -72,10 +74,10 @@ def shade_environment_visibility(
             raise ValueError("`triangle` and `weights` belong to a models.Visibility; pass that as `visibility`.")
         c, _ = _checks.coefficients("visibility", visibility)
         if c.ndim == 1:
-            return shade_environment(lobes, multiply(e, c, lobes.degree), normals, views, tangents)
+            return shade_environment(lobes, multiply(e, c, lobes.degree), normals, views, tangents, mask=mask)
         own, v, dtypes = {"visibility": c}, None, [e.dtype, c.dtype]
     light = [("light_coefficients", e.shape[:-1])]
-    lobes, points, colour = surface("lobes", lobes, tangents, light, dtypes, **vectors)
+    lobes, points, colour = surface("lobes", lobes, tangents, light, dtypes, mask, **vectors)
     try:
         np.broadcast_shapes(*(a.shape[:-1] for a in (points | own).values()))
     except ValueError as error:
@@ -121,4 +123,4 @@ def _shade(
         return jnp.broadcast_to(values.reshape(*colour, -1), (*colour, len(local)))
 
     tile = _NUMBERS_AT_ONCE // ((degree + 1) ** 2 * len(product))
-    return shade_tiles(lobes, points, colour, max(64, tile), radiance)
+    return shade_tiles(lobes, points, colour, max(64, tile), radiance, (e, v))

@@ -6,8 +6,6 @@ frame they are harmonics at the local direction of the axis: nothing is rotated.
 notation: a = axis; z_l = coefficients of the zonal light; pi_l = sqrt(4 pi/(2l+1)); R = (t, b, n) local to world.
 """
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +17,7 @@ from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import _tables, sh_basis
 from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
-from shisd.shading._surface import shade_points, shade_tiles, surface
+from shisd.shading._surface import shade_points, shade_tiles, sum_lights, surface
 
 
 def shade_zonal(
@@ -29,12 +27,15 @@ def shade_zonal(
     normals: ArrayLike,
     views: ArrayLike,
     tangents: ArrayLike | None = None,
+    *,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under distant light that is symmetric about an axis.
 
     Arguments: `lobes` from `tabulate_brdf`; `axis` [3] in world space, of any length but zero; `zonal_coefficients`
     [*colour, L+1], those of y_l^0 about it (those of usual profiles: `decomposition.CapKernel`, `GaussianKernel`, ...,
-    `.zonal`); for S lights [S, 3] and [S, *colour, L+1]; the others and what is returned as in `shade_environment`.
+    `.zonal`); for S lights [S, 3] and [S, *colour, L+1]; the others, `mask` too, and what is returned as in
+    `shade_environment`.
     For one material under the same lights at very many points, `prefilter` makes reflection maps of them.
     Derivatives: in every floating argument, both modes, any order; where view or axis lie along the normal, the first.
     Accuracy: that of `shade_environment` with the same light.
@@ -53,8 +54,8 @@ def shade_zonal(
         )
     if not lights:
         a, z = a[None], z[None]
-    light = [("zonal_coefficients", z.shape[1:-1])]
-    lobes, points, colour = surface("lobes", lobes, tangents, light, [a.dtype, z.dtype], normals=normals, views=views)
+    light, dtypes = [("zonal_coefficients", z.shape[1:-1])], [a.dtype, z.dtype]
+    lobes, points, colour = surface("lobes", lobes, tangents, light, dtypes, mask, normals=normals, views=views)
     dtype = lobes.weights.dtype
     z = z[..., : lobes.degree + 1].astype(dtype)
     return by_device(shade_points, points, _shade, lobes, normalize(a.astype(dtype)), z, colour)
@@ -76,8 +77,12 @@ def _shade(
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
         slices = slice_values(table, local, lobes)
-        along = [sh_basis(jnp.einsum("pij,i->pj", frame, axis), degree).T for axis in axes]
-        light = [times(own[..., None], y) for own, y in zip(z, along, strict=True)]
-        return jnp.sum(times(slices, functools.reduce(jnp.add, light)), axis=-2)
 
-    return shade_tiles(lobes, points, colour, 1024, radiance)
+        def of_light(one: tuple[Array, Array]) -> Float[Array, "*c n p"]:
+            axis, own = one
+            return times(own[..., None], sh_basis(jnp.einsum("pij,i->pj", frame, axis), degree).T)
+
+        light = sum_lights(of_light, [(axes, z)], jnp.zeros((*z.shape[1:], len(local)), z.dtype))
+        return jnp.sum(times(slices, light), axis=-2)
+
+    return shade_tiles(lobes, points, colour, 1024, radiance, (axes, z))

@@ -211,7 +211,7 @@ def portal_task(name: str, stored) -> Task:
     coefficients, methods = stored["portal light"], []
     for degree in (4, 12):
         table, seconds = fitted_lobes(name, degree)
-        light, more = timed(models.PortalLight, QUADS["floor"], coefficients, degree)
+        light, more = timed(models.PortalLight, QUADS["floor"], coefficients)
         parameters = table, light
         own = Method("shisd", f"degree {degree}", shade_portal, parameters, setup=seconds + more, ours=True)
         product, more = timed(functools.partial(harmonics.product_matrix, input_degree=degree), coefficients, degree)

@@ -129,7 +129,7 @@ evaluate = jax.jit(harmonics.evaluate).lower(light[:, None], over(many, "points"
 assert collectives(evaluate) == {}
 close(evaluate(light[:, None], over(many, "points")), harmonics.evaluate(light[:, None], many))
 
-window = models.PortalLight(corners, light, degree)
+window = models.PortalLight(corners, light)
 p = over(normals, "rows", "columns", **both)
 portal = lambda positions: shading.shade_portal(upper, window, positions, normals, views)
 close(portal(p), portal(normals))
