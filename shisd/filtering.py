@@ -24,12 +24,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import cg
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks, io
 from shisd._numerics import normalize, safe_sqrt
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition._kernels import gaussian_zonal
 from shisd.harmonics import _tables, sh_basis
 from shisd.models import MeasuredBrdf, ProjectedBrdf
@@ -44,7 +44,7 @@ _PROBES = 256  # pairs of directions at which coverage is judged
 class FitStatus(eqx.Enumeration):
     """How a fit ended."""
 
-    ok = ""
+    ok = "The fit is found."
     uncovered = (
         "Samples leave out parts of the hemisphere that this degree resolves; the ridge decides there. Lower `degree`, "
         "raise `ridge`, or add samples."

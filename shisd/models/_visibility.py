@@ -20,15 +20,14 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks, io
+from shisd._module import Module
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.domains._region import cap_coefficients
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
@@ -37,7 +36,7 @@ from shisd.harmonics._sh import weighted_sums
 _RAYS_AT_ONCE = 1 << 20
 
 
-class Visibility(eqx.Module):
+class Visibility(Module):
     """Band-limited visibility at the vertices of a mesh, interpolated linearly over its triangles, or at single points.
 
     Fields: `coefficients` [V, (L+1)^2] in the frame of the mesh; `triangles` [F, 3], the vertices of each, F = 0 for
@@ -66,7 +65,7 @@ class Visibility(eqx.Module):
             known = _known(value)
             if known is not None and not np.all(np.isfinite(known)):
                 raise ValueError(f"`{name}` must be finite; {int(np.sum(~np.isfinite(known)))} of its numbers are not.")
-        self.coefficients, self.triangles = c, jnp.asarray(corners).astype(np.int32)
+        self.coefficients, self.triangles = c, jnp.asarray(corners.astype(np.int32))
         self.noise = jnp.broadcast_to(deviation, c.shape[:1])
 
     @property
@@ -209,7 +208,7 @@ def surface_corners(visibility: Visibility, triangle: ArrayLike, weights: ArrayL
     if len(triangles) == 0:
         raise ValueError("`visibility` has no triangles: it is that of points, whose rows are its `coefficients`.")
     _check_range("triangle", index, len(triangles), "triangles")
-    index = jnp.asarray(index)
+    index = jnp.asarray(index.astype(np.int32))
     corners = triangles[index]
     there = ((index >= 0) & (index < len(triangles)))[..., None] & (corners >= 0) & (corners < count)
     return corners, jnp.where(there, w.astype(visibility.coefficients.dtype), np.nan)

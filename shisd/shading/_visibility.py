@@ -15,11 +15,10 @@ notation: u = coefficients of the visible light; R = (t, b, n) local to world.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import multiply
 from shisd.harmonics._pairing import Each, pair_many, rows
