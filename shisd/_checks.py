@@ -8,9 +8,8 @@ import operator
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from shisd._typing import Array
+from shisd._typing import Array, ArrayLike
 
 
 def real_array(name: str, value: ArrayLike) -> Array:

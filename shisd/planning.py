@@ -22,10 +22,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._typing import Array, Float
+from shisd._module import Module
+from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import RotatedZonalBasis, optimized_directions
 from shisd.decomposition._directions import TABLE_DEGREE
 from shisd.harmonics import _tables, convolve, evaluate, multiply, sphere_rule
@@ -47,7 +47,7 @@ _ELEVATIONS = 12  # of the views whose slices are judged: Gauss nodes
 _AZIMUTHS = 6  # of these views, for anisotropic materials
 
 
-class Scene(eqx.Module):
+class Scene(Module):
     """What is to be shaded: every material under the sum of all lights, without occlusion.
 
     Arguments: `materials` and `lights` by name; a light is a `models.Environment`, SH coefficients [n] or [colour, n]
@@ -94,7 +94,7 @@ class Entry(NamedTuple):
     met: bool
 
 
-class Plan(eqx.Module):
+class Plan(Module):
     """Decisions, and all that is needed to shade by them: tables of the materials and lights cut to their degree.
 
     `str(plan)` is a table to read. `shade` is differentiable in everything but the materials and lights, which are
@@ -153,7 +153,7 @@ class Plan(eqx.Module):
         ])  # fmt: skip
 
 
-class Path(eqx.Module):
+class Path(Module):
     """One way from a material and a light to radiance: where it serves, what it leaves out, its cost, and the call.
 
     A new path is one more class in `PATHS`.

@@ -9,7 +9,11 @@ import jax
 import numpy as np
 import pytest
 
-from shisd import decomposition, filtering, harmonics, models
+from shisd import decomposition, domains, filtering, harmonics, models, planning, reference, shading
+
+STAGES = (harmonics, decomposition, domains, models, shading, filtering, planning, reference)
+PUBLIC = {f"{s.__name__}.{name}": thing for s in STAGES for name, thing in vars(s).items() if name[0] != "_"}
+PUBLIC = {name: x for name, x in PUBLIC.items() if callable(x) and getattr(x, "__module__", "").startswith("shisd")}
 
 
 def test_everything_is_there_after_import_and_optional_packages_are_not_loaded():
@@ -24,11 +28,16 @@ def test_arrays_have_one_name_in_signatures():
     shown = str(inspect.signature(models.Visibility.from_mesh))
     assert shown.startswith("(vertices: ArrayLike, triangles: ArrayLike, degree: int, *, points: Optional[ArrayLike]")
     assert shown.endswith("progress: Progress = None) -> 'Visibility'")
+    for name, thing in PUBLIC.items():
+        assert "numpy.bool" not in str(inspect.signature(thing)), name
 
 
 def test_objects_show_their_numbers():
     seen = models.Visibility(np.ones((6, 4), np.float32), np.array([[0, 1, 2]]), 0.5)
     assert repr(seen) == "Visibility(coefficients=f32[6,4], triangles=[[0, 1, 2]], noise=f32[6])"
+    assert repr(models.CookTorrance(0.25, 1.0, np.array([0.9, 0.5, 0.25], np.float32))).startswith(
+        "CookTorrance(roughness=0.25, metallic=1.0, albedo=[0.9, 0.5, 0.25]"
+    )
     inside = jax.jit(lambda s: print(repr(s), file=sys.stderr) or s.noise)
     assert inside(seen).shape == (6,)
 

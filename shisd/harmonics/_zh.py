@@ -9,10 +9,9 @@ notation: P_l(x), x = cosine to the axis; y_l^0(x) = sqrt((2l+1)/4 pi) P_l(x).
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _tables
 
 

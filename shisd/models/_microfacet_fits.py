@@ -11,9 +11,8 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 
-from shisd._typing import Array, Scalar, Vector
+from shisd._typing import Array, ArrayLike, Scalar, Vector
 from shisd.models._brdf import AbstractBrdf, Colour, above_horizon, cast, colour, half_vector
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._typing import Array, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import _tables
@@ -30,7 +31,7 @@ Pytree = TypeVar("Pytree")
 RIDGE = 1e-6  # of fits above the horizon
 
 
-class Lobes(eqx.Module):
+class Lobes(Module):
     """RZH weights of a material's cosine-weighted slices, tabulated over local view directions (ISD15 Eq. 21).
 
     weights: [*colour, V, L+1, K] for isotropic materials, in views at elevations (j + 1/2) (pi/2)/V from the normal and
