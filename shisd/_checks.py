@@ -11,9 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import ArrayLike
 
-from shisd._typing import Array
+from shisd._typing import Array, ArrayLike
 
 
 def any_array(name: str, value: ArrayLike) -> Array:

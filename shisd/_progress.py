@@ -7,7 +7,9 @@ A call that takes it has `progress`: None, nothing is told; True, a bar of the p
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-Progress = Callable[[int, int], object] | bool | None
+from typing_extensions import TypeAliasType
+
+Progress = TypeAliasType("Progress", Callable[[int, int], object] | bool | None)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ z = the smooth logarithm, P = penalty of each cosine wave.
 import functools
 import os
 import warnings
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,11 +24,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import cg
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks, io
 from shisd._numerics import normalize, safe_sqrt
-from shisd._typing import Array, Float, Scalar
+from shisd._progress import Progress, reporting
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition._kernels import gaussian_zonal
 from shisd.harmonics import _tables, sh_basis
 from shisd.models import MeasuredBrdf, ProjectedBrdf
@@ -35,13 +37,14 @@ from shisd.models._measured import fill_nearest
 from shisd.models._projected import symmetric
 
 _TILE = 1024  # samples whose harmonics are in memory at a time
+_SMOOTHNESS = (1.0, 10.0, 100.0, 1000.0)  # what is tried for tables
 _PROBES = 256  # pairs of directions at which coverage is judged
 
 
 class FitStatus(eqx.Enumeration):
     """How a fit ended."""
 
-    ok = ""
+    ok = "The fit is found."
     uncovered = (
         "Samples leave out parts of the hemisphere that this degree resolves; the ridge decides there. Lower `degree`, "
         "raise `ridge`, or add samples."
@@ -269,6 +272,7 @@ def denoise_merl(
     smoothness: float | None = None,
     mirrored: bool = False,
     dtype: DTypeLike = np.float32,
+    progress: Progress = None,
 ) -> DenoisedMerl:
     """A clean material from a noisy MERL table with holes.
 
@@ -281,7 +285,8 @@ def denoise_merl(
     Arguments: `source`, a path for `io.read_merl` or a table [90, 90, 180, 3] in 1/sr. Negative and non-finite bins are
     missing. `smoothness` > 0; None takes the one of 1, 10, 100 and 1000 that best predicts a tenth of the bins from the
     others. `mirrored=True` makes bins at phi_d and 180 degrees - phi_d one, as they are for materials that are their
-    own mirror image: half the work and less noise, but what a table holds of differences is lost.
+    own mirror image: half the work and less noise, but what a table holds of differences is lost. `progress`: None,
+    True for a bar of tqdm, or a function of fits that are done and in all.
     Bins below the horizon take the nearest value from above it; large gaps stay within the range of the data.
     Errors: those of `read_merl`; ValueError for another shape, a colour without a positive value, or a float64 result
     without x64. Where more than a tenth of the pairs of theta_h and theta_d have no valid bin, it warns.
@@ -314,9 +319,16 @@ def denoise_merl(
     dark = np.array([np.median(table[..., c][table[..., c] > 0]) for c in range(3)]) / 1000
     log, count = (np.moveaxis(a, -1, 0).astype(np.float32) for a in (np.log(mean + dark), count))
     noise = float("nan")
-    if smoothness is None:
-        smoothness, noise = _choose(log, count)
-    z = [np.asarray(_smooth(y, w, smoothness), np.float64) for y, w in zip(log, count, strict=True)]
+    with reporting(progress, 3 if smoothness is not None else 3 + len(_SMOOTHNESS), "fits") as step:
+
+        def fit(y: np.ndarray, w: np.ndarray, smoothness: float) -> np.ndarray:
+            z = np.asarray(_smooth(y, w, smoothness), np.float64)
+            step()
+            return z
+
+        if smoothness is None:
+            smoothness, noise = _choose(log, count, fit)
+        z = [fit(y, w, smoothness) for y, w in zip(log, count, strict=True)]
     lowest, highest = (f(np.where(count > 0, log, np.nan), axis=(1, 2, 3)) for f in (np.nanmin, np.nanmax))
     smooth = np.maximum(np.exp(np.clip(np.stack(z, axis=-1), lowest, highest)) - dark, 0)
     smooth = np.concatenate([smooth, smooth[:, :, ::-1]], axis=2) if mirrored else smooth
@@ -329,7 +341,7 @@ def denoise_merl(
     return DenoisedMerl(MeasuredBrdf(result), float(smoothness), noise, missing, extrapolated)
 
 
-def _choose(log: np.ndarray, count: np.ndarray) -> tuple[float, float]:
+def _choose(log: np.ndarray, count: np.ndarray, fit: Callable[..., np.ndarray]) -> tuple[float, float]:
     """The smoothness that best predicts bins that were held out, over the mean of colours, and the RMS difference."""
     known = np.all(count > 0, axis=0)
     y = log.mean(axis=0)
@@ -337,9 +349,8 @@ def _choose(log: np.ndarray, count: np.ndarray) -> tuple[float, float]:
     out = known & (np.random.default_rng(0).random(known.shape) < 0.1)
     if not out.any():
         raise ValueError("`source` has too few bins that are valid in all colours to choose by; pass `smoothness`.")
-    tries = (1.0, 10.0, 100.0, 1000.0)
-    errors = [np.average((np.asarray(_smooth(y, np.where(out, 0, w), s)) - y)[out] ** 2, weights=w[out]) for s in tries]
-    return tries[int(np.argmin(errors))], float(np.sqrt(np.min(errors)))
+    errors = [np.average((fit(y, np.where(out, 0, w), s) - y)[out] ** 2, weights=w[out]) for s in _SMOOTHNESS]
+    return _SMOOTHNESS[int(np.argmin(errors))], float(np.sqrt(np.min(errors)))
 
 
 @jax.jit

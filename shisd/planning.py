@@ -23,11 +23,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import RotatedZonalBasis, optimized_directions
 from shisd.decomposition._directions import TABLE_DEGREE
 from shisd.harmonics import _tables, convolve, evaluate, multiply, sphere_rule
@@ -50,7 +50,7 @@ _DARK = 1e-6  # of the brightest colour's radiance: a colour below it is roundin
 _AZIMUTHS = 6  # of these views, for anisotropic materials
 
 
-class Scene(eqx.Module):
+class Scene(Module):
     """What is to be shaded: every material under the sum of all lights, without occlusion.
 
     Arguments: `materials` and `lights` by name; a light is a `models.Environment`, SH coefficients [n] or [colour, n]
@@ -99,7 +99,7 @@ class Entry(NamedTuple):
     met: bool
 
 
-class Plan(eqx.Module):
+class Plan(Module):
     """Decisions, and all that is needed to shade by them: tables of the materials and lights cut to their degree.
 
     `str(plan)` is a table to read. `shade` is differentiable in everything but the materials and lights, which are
@@ -158,7 +158,7 @@ class Plan(eqx.Module):
         ])  # fmt: skip
 
 
-class Path(eqx.Module):
+class Path(Module):
     """One way from a material and a light to radiance: where it serves, what it leaves out, its cost, and the call.
 
     A new path is one more class in `PATHS`.

@@ -15,18 +15,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import normalize
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.models import AbstractBrdf, Environment
 
 Radiance = ArrayLike | Callable[[Array], Array]
 Visible = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-class Estimate(eqx.Module):
+class Estimate(Module):
     """A value and one standard deviation of its own error, in the units of the value."""
 
     value: Array
@@ -199,7 +199,7 @@ def _strata(count: int) -> tuple[np.ndarray, np.ndarray]:
     return corners, np.broadcast_to([1 / rows, 1 / columns], corners.shape)
 
 
-class _MapDensity(eqx.Module):
+class _MapDensity(Module):
     """A density on the sphere that follows a map, up to sin(theta) inside a texel.
 
     A texel is chosen by its power, then a point of it, uniformly in theta and phi.

@@ -244,6 +244,8 @@ def test_a_large_gap_is_told_and_filled_within_the_range_of_the_data():
     table[:40] = -1
     table[60:70, :, :, 1] = np.nan
     with pytest.warns(UserWarning, match="have no valid bin; they are extrapolated"):
-        result = filtering.denoise_merl(table, smoothness=10.0, mirrored=True)
+        told = []
+        result = filtering.denoise_merl(table, smoothness=10.0, mirrored=True, progress=lambda *now: told.append(now))
+    assert told == [(1, 3), (2, 3), (3, 3)]
     np.testing.assert_allclose(result.brdf.table, 1, atol=1e-3)
     assert np.isnan(result.noise)

@@ -17,17 +17,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._methods import method
+from shisd._module import Module
 from shisd._numerics import normalize, same_dtype
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition._directions import check_count
 from shisd.harmonics import sh_basis
 
 
-class RotatedZonalBasis(eqx.Module):
+class RotatedZonalBasis(Module):
     """The kernels y_l^0(w . z_k) of all bands l = 0 ... L about shared axes z_k (ISD15 Eq. 8 and 12).
 
     Arguments: `directions` [K, 3], K >= 2L+1 axes, of any length but zero: the field holds unit vectors. Static

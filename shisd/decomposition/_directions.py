@@ -18,11 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import normalize
-from shisd._typing import Array, Float, Scalar
+from shisd._progress import Progress, reporting
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.harmonics import legendre
 
 TABLE_DEGREE = 64
@@ -133,6 +134,7 @@ def optimize_directions(
     mirror: Literal["x", "y", "z"] | None = None,
     powers: Sequence[float] = (1.0, 3.0, 8.0),
     max_steps: int = 256,
+    progress: Progress = None,
 ) -> Float[Array, "K 3"]:
     """`directions` moved to lower the worst condition number of bands 0 ... `degree`.
 
@@ -144,7 +146,8 @@ def optimize_directions(
     `max_steps` steps per power. Static `mirror`: keep the set closed under reflection at the plane "x" = 0, "y" = 0 or
     "z" = 0: its first axis lies in the plane, and 2i is the image of 2i - 1 (K must be odd); the start gives the axes
     1, 3, 5, ... A set closed under reflection at "y" has weights that come in pairs for isotropic materials seen along
-    x. Axes are antipodal in themselves: z and -z are one.
+    x. Axes are antipodal in themselves: z and -z are one. `progress`: None, True for a bar of tqdm, or a function of
+    powers that are done and in all, over all starts.
     Returns unit vectors [K, 3] in the same order, hemispheres not restored. Work in float64 for the last digits.
     A singular start, whose loss is not finite, comes back as it is: the basis refuses it with a clear message.
     Derivatives: none are meant; differentiate `conditioning_loss`.
@@ -157,42 +160,47 @@ def optimize_directions(
         raise ValueError(f"`mirror` must be None, 'x', 'y' or 'z'; got {mirror!r}.")
     if mirror is not None and starts.shape[-2] % 2 == 0:
         raise ValueError(f"`mirror` needs an odd number of axes: one in the plane, and pairs; got {starts.shape[-2]}.")
+    levels = [float(power) for power in powers]
+    if not levels or not all(power > 0 for power in levels):
+        raise ValueError(f"`powers` must hold at least one number, all > 0; got {levels}.")
     steps, plane = _checks.integer("max_steps", max_steps, 1), None if mirror is None else "xyz".index(mirror)
     powers = tuple(_checks.number("powers", power, positive=True) for power in powers)
     if not powers:
         raise ValueError("`powers` must hold at least one power.")
     starts = normalize(starts if several else starts[None])
-    return _minimise(
-        starts, jnp.asarray(powers, dtype=starts.dtype), degree, steps, bool(nested), _bands(bands, degree), plane
-    )
+    found, losses = [], []
+    with reporting(progress, len(starts) * len(levels), "directions") as step:
+        for start in starts:
+            z = start if plane is None else jnp.concatenate([start[:1], start[1::2]])
+            for power in levels:
+                z, loss = _minimise(z, jnp.asarray(power, z.dtype), degree, steps, bool(nested), _bands(bands, degree),
+                                    plane)  # fmt: skip
+                jax.block_until_ready(z)
+                step()
+            found.append(z)
+            losses.append(loss)
+    best = jnp.stack(found)[jnp.nanargmin(jnp.stack(losses))]
+    return normalize(best if plane is None else _mirrored(best, plane))
 
 
 @eqx.filter_jit
 def _minimise(
-    starts: Float[Array, "S K 3"],
-    powers: Float[Array, " p"],
+    free: Float[Array, "k 3"],
+    power: Scalar,
     degree: int,
     max_steps: int,
     nested: bool,
     bands: tuple[int, ...],
     plane: int | None,
-) -> Float[Array, "K 3"]:
-    free = starts if plane is None else jnp.concatenate([starts[:, :1], starts[:, 1::2]], axis=1)
+) -> tuple[Float[Array, "k 3"], Scalar]:
+    """Axes of a lower loss, and that loss; those that came where it is not lower or not a number."""
     whole = (lambda z: z) if plane is None else lambda z: _mirrored(z, plane)
     loss = lambda z, power: _loss(normalize(whole(z)), power, degree, nested, bands)
-    tolerance = float(jnp.finfo(starts.dtype).eps) ** 0.5
+    tolerance = float(jnp.finfo(free.dtype).eps) ** 0.5
     solver = optx.BFGS(rtol=tolerance, atol=tolerance)
-
-    def stage(z, power):
-        found = normalize(optx.minimise(loss, solver, z, power, max_steps=max_steps, throw=False).value)
-        return jnp.where(loss(found, power) < loss(z, power), found, z), None  # False for NaN
-
-    def run(z):
-        z = jax.lax.scan(stage, z, powers)[0]
-        return z, loss(z, powers[-1])
-
-    found, losses = jax.lax.map(run, free)
-    return normalize(whole(found[jnp.nanargmin(losses)]))
+    found = normalize(optx.minimise(loss, solver, free, power, max_steps=max_steps, throw=False).value)
+    before, after = loss(free, power), loss(found, power)
+    return jnp.where(after < before, found, free), jnp.where(after < before, after, before)
 
 
 def _mirrored(free: Float[Array, "h 3"], plane: int) -> Float[Array, "k 3"]:

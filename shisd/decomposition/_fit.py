@@ -17,18 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.scipy.linalg import cho_factor, cho_solve
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition._mixtures import AbstractLobes, GaussianLobes
 
 
 class FitStatus(eqx.Enumeration):
     """How a fit ended."""
 
-    ok = ""
+    ok = "The lobes are found."
     step_limit = (
         "The fit used up its steps; its best lobes are kept. Raise `max_steps` or `tolerance`, or give other starts."
     )

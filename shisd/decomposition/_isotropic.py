@@ -18,19 +18,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._methods import method
+from shisd._module import Module
 from shisd._numerics import normalize, safe_sqrt, same_dtype
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import _basis
 from shisd.decomposition._directions import check_count
 from shisd.decomposition._kernels import AbstractKernel
 from shisd.harmonics import convolve, evaluate, sample_map, sh_basis, synthesize_map
 
 
-class Decomposition(eqx.Module):
+class Decomposition(Module):
     """Weights with what is known about them.
 
     weights [..., L+1, K]; residual [...], |M weights - c| / |c|, zero where c is; condition_number of M, without ridge.
@@ -41,7 +41,7 @@ class Decomposition(eqx.Module):
     condition_number: Scalar
 
 
-class IsotropicBasis(eqx.Module):
+class IsotropicBasis(Module):
     """Kernels phi_l(w . z_lk) of all levels l = 0 ... L about given axes (ISD15 Eq. 5).
 
     Arguments: `kernel`, the mother kernels (`GaussianKernel()`, `FunctionKernel(f)`, ...), cut off above band L and

@@ -22,10 +22,11 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
-from shisd._typing import Array, Float, Scalar
+from shisd._module import Module
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.harmonics import _quadrature, _tables, legendre, zonal_basis
 from shisd.harmonics._zh import legendre_of_versine
 
@@ -57,7 +58,7 @@ def _widths(
     return _checks.require(widths, good, "The widths of the kernel must be finite and not negative.")
 
 
-class AbstractKernel(eqx.Module):
+class AbstractKernel(Module):
     """Isotropic functions of the cosine to their axis, one for each level l = 0, 1, 2, ...
 
     A kernel of your own: `FunctionKernel(function)`.

@@ -9,17 +9,17 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._methods import method
+from shisd._module import Module
 from shisd._numerics import normalize
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition._kernels import gaussian_zonal
 from shisd.harmonics import convolve, sh_basis, zonal_basis
 
 
-class AbstractLobes(eqx.Module):
+class AbstractLobes(Module):
     """A weighted sum of isotropic lobes about axes of their own: `GaussianLobes` or `ZonalLobes`."""
 
     directions: eqx.AbstractVar[Float[Array, "J 3"]]

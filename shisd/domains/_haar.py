@@ -12,16 +12,16 @@ import functools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import dot, normalize
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, clip, loop_solid_angle, on_sphere
 
 
-class HaarBasis(eqx.Module):
+class HaarBasis(Module):
     """Orthonormal Haar wavelets on the octants, split `levels` times (static, from 0): `size` = 8 * 4^levels functions.
 
     Coefficients [size]: those of the eight octants' normalised indicators first, then three wavelets for every cell,

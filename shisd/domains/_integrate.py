@@ -15,11 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import dot, normalize, same_dtype
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import fibonacci_directions, optimized_directions
 from shisd.decomposition._directions import TABLE_DEGREE
 from shisd.domains import _moments

@@ -8,15 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import arctan2, cross, dot, normalize, same_dtype
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.domains._moments import Loop, sides
 
 
-class SphericalPolygon(eqx.Module):
+class SphericalPolygon(Module):
     """A region of the sphere bounded by great arcs between unit vertices.
 
     Arguments: `vertices` [slots, 3], unit vectors, each arc shorter than pi; `count`, how many of them are used (all,

@@ -1,18 +1,17 @@
 """Caps and hemispheres, whose integrals have closed forms."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import normalize
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.harmonics import _tables, sh_basis
 from shisd.harmonics._zh import legendre_of_versine
 
 
-class SphericalCap(eqx.Module):
+class SphericalCap(Module):
     """The directions within `angle` of an axis.
 
     Arguments: `axis` [3], of any length but zero; `angle` in rad, from 0 to pi. All integrals are NaN for others.

@@ -8,10 +8,9 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _tables
 
 CONVENTIONS = ("shisd", "sphericart", "unsigned", "e3nn", "scipy")

@@ -11,11 +11,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _quadrature, _tables, _transform
 
 

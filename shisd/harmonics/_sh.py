@@ -16,12 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import angle_multiples, normalize
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _tables
 
 _POINTS_AT_ONCE = 1 << 15  # beyond this, expansions are evaluated in tiles so that memory stays bounded

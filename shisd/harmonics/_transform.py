@@ -21,12 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _quadrature, _tables
 
 Rows = Literal["gauss", "fejer", "cells"]

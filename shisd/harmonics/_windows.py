@@ -16,12 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._sharding import by_device
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.harmonics import _quadrature, _sh, _tables, _transform
 
 _CANDIDATES, _STEPS = 8, 6  # local minima of the grid that are refined, and Newton steps from each
@@ -88,7 +87,7 @@ def apply_window(coefficients: ArrayLike, window: ArrayLike) -> Float[Array, "*b
 class WindowStatus(eqx.Enumeration):
     """Whether a window can keep the expansion above the floor."""
 
-    ok = ""
+    ok = "A window keeps the expansion above the floor."
     mean_below_floor = (
         "No window lifts an expansion above its own mean, which is not above `floor`. Lower `floor`, or check that the "
         "function is positive and its coefficients are finite."

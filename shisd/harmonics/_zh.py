@@ -11,10 +11,9 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _tables
 
 

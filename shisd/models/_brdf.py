@@ -14,11 +14,12 @@ from typing import ClassVar, TypeVar, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import normalize
-from shisd._typing import Array, Float, Scalar, Vector
+from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
 
 Colour = Float[Array, "..."]  # () or (3,); the parameters of one model may mix both
 Parameter = ArrayLike | Sequence[float]
@@ -26,7 +27,7 @@ Pytree = TypeVar("Pytree")
 SMOOTHEST = 1e-6  # roughness below it is taken as it: with the half vector's rounding nothing narrower is resolved
 
 
-class AbstractBrdf(eqx.Module):
+class AbstractBrdf(Module):
     """Reflection at one point, in its local frame: +z is the normal, both directions point away from the surface.
 
     A BRDF takes one pair of unit vectors [3]; use `jax.vmap` for more. Its result has the shape `colour`: () when every

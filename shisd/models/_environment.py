@@ -8,10 +8,11 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks, harmonics, io
-from shisd._typing import Array, Float
+from shisd._module import Module
+from shisd._typing import Array, ArrayLike, Float
 
 
 def _map(value: ArrayLike) -> Array:
@@ -27,7 +28,7 @@ def _map(value: ArrayLike) -> Array:
     return texels
 
 
-class Environment(eqx.Module):
+class Environment(Module):
     """Radiance from every direction, as texels of an equirectangular map.
 
     Texel (j, i) of [H, W = 2H] is centred at theta = pi (j + 1/2) / H from +z and phi = 2 pi (i + 1/2) / W from +x

@@ -5,16 +5,16 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import times
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.domains._region import cap_integrals
 from shisd.harmonics import _tables, product_matrix
 
 
-class PolygonLight(eqx.Module):
+class PolygonLight(Module):
     """A flat polygon in world space that emits, from every point, the same radiance.
 
     Arguments: `points` [S, 3], S >= 3, in the unit of length of the scene, any outline, counter-clockwise seen from the
@@ -52,7 +52,7 @@ class PolygonLight(eqx.Module):
         return jnp.broadcast_shapes(self.emission.shape, () if self.profile is None else self.profile.shape[:-1])
 
 
-class PortalLight(eqx.Module):
+class PortalLight(Module):
     """A window: a polygon in world space through which distant light is seen (CSH18 section 5.1).
 
     Arguments: `points` [S, 3] as those of a `PolygonLight`, counter-clockwise seen from the side that is lit;
@@ -79,7 +79,7 @@ def product_matrices(light: Float[Array, "*colour_n"], degree: int, input_degree
     return of_one(light) if light.ndim == 1 else jax.vmap(of_one)(light)
 
 
-class SphereLight(eqx.Module):
+class SphereLight(Module):
     """A ball that emits, from every point of its surface and in all directions, the same radiance (ISD15 section 7.3).
 
     Arguments: `center` [3] and `radius` > 0, in the unit of length of the scene; `emission`, scalar or [colour], in

@@ -13,10 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import io
-from shisd._typing import Array, Float, Scalar, Vector
+from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
 from shisd.models._brdf import AbstractBrdf, above_horizon, parameter
 
 SHAPE = (90, 90, 180, 3)

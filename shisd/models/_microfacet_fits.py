@@ -12,9 +12,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from shisd._typing import Array, Scalar, Vector
+from shisd._typing import Array, ArrayLike, Scalar, Vector
 from shisd.models._brdf import AbstractBrdf, Colour, above_horizon, cast, colour, half_vector
 
 TINY = float(np.finfo(np.float32).tiny)  # the least positive number, where a parameter has to be positive

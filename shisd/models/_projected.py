@@ -12,10 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
-from shisd._typing import Array, Float, Scalar, Vector
+from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
 from shisd.harmonics import _tables, sh_basis
 from shisd.models._brdf import AbstractBrdf, Colour, above_horizon
 

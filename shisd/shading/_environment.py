@@ -13,11 +13,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics._pairing import pair_many, turned_series
 from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import Surface, shade_points, shade_tiles, surface

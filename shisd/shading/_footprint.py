@@ -14,11 +14,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import normalize
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.shading._surface import frame
 
 _OFF_PLANE = 0.5  # sine of the angle to either tangent plane from which on a neighbour is on another surface
@@ -33,7 +33,7 @@ def _axes(name: str, value: ArrayLike) -> Array:
     return axes
 
 
-class MirrorFootprint(eqx.Module):
+class MirrorFootprint(Module):
     """Mirror directions of pixels, and how these spread over the pixel's filter, a Gaussian.
 
     `directions` [..., 3], unit; `axes` [..., 3, 2], the change of direction over one standard deviation of the filter

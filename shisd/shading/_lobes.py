@@ -16,13 +16,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._methods import method
+from shisd._module import Module
 from shisd._numerics import safe_sqrt
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import _tables
 from shisd.harmonics._pairing import rows
@@ -34,7 +35,7 @@ Pytree = TypeVar("Pytree")
 RIDGE = 1e-6  # of fits above the horizon
 
 
-class Lobes(eqx.Module):
+class Lobes(Module):
     """RZH weights of a material's cosine-weighted slices, tabulated over local view directions (ISD15 Eq. 21).
 
     weights: [*colour, V, L+1, K] for isotropic materials, in views at elevations (j + 1/2) (pi/2)/V from the normal and

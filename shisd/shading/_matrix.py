@@ -19,13 +19,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._methods import method
+from shisd._module import Module
 from shisd._numerics import angle_multiples, safe_sqrt
 from shisd._sharding import by_device
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import _quadrature, _tables, sh_basis
 from shisd.models import AbstractBrdf
@@ -37,7 +38,7 @@ from shisd.shading._surface import shade_points, surface
 _VIEW_RIDGE = 1e-10  # of fits over views
 
 
-class BrdfMatrix(eqx.Module):
+class BrdfMatrix(Module):
     """The matrix F of a material, from harmonics of the view to those of its cosine-weighted slice.
 
     blocks: for isotropic materials, the block [*colour, L+1-m, Lv+1-m] of every order m up to the lesser of L and Lv,

@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import angle_multiples, normalize, safe_sqrt
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _sh, _tables, _transform, project_map, sample_map, synthesize_map
 from shisd.harmonics._pairing import pair_many, rows, turned_series
 from shisd.shading._footprint import MirrorFootprint
@@ -63,7 +63,7 @@ def shade_mirror(
     return by_device(shade_points, points, _anisotropic if anisotropic else _isotropic, e)
 
 
-class MirrorMaps(eqx.Module):
+class MirrorMaps(Module):
     """A map and what Gaussians of a few `variances` [levels], in rad^2, make of it: `texels` [H, 2H, levels, colours].
 
     The first variance is 0, its level the map itself.

@@ -17,12 +17,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import dot, times
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.domains import HaarBasis
 from shisd.domains._haar import clip_to_cells
 from shisd.domains._integrate import fold_expansion, loop_coefficients, zonal_inverse

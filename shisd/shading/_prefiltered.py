@@ -25,12 +25,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
+from shisd._module import Module
 from shisd._numerics import arctan2, normalize, safe_sqrt
 from shisd._sharding import by_device
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.harmonics import _tables
 from shisd.shading import _views
 from shisd.shading._lobes import Lobes, check_lobes
@@ -41,7 +41,7 @@ DARK = 1e-12  # of the brightest colour's mean square: what is below is rounding
 _ROWS_PER_BAND = 3  # texels from pole to pole for each band: cubic splines are then good to 1e-3 of the highest one
 
 
-class PrefilteredLobes(eqx.Module):
+class PrefilteredLobes(Module):
     """A material under one distant light, as `prefilter` makes it: `channels` terms, predicted relative `error`.
 
     `maps` [texels, M * colours], splines of U and V over two charts, and `profiles` [V+4, M * colours], those of a over

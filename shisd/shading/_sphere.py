@@ -12,11 +12,10 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 
 from shisd._numerics import times
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.domains._region import cap_coefficients
 from shisd.models import SphereLight
 from shisd.models._light import versine

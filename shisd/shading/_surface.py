@@ -12,11 +12,11 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import normalize
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 
 Shape = tuple[int, ...]
 

@@ -15,11 +15,10 @@ notation: u = coefficients of the visible light; R = (t, b, n) local to world.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import multiply
 from shisd.harmonics._pairing import Each, pair_many, rows
@@ -48,9 +47,9 @@ def shade_environment_visibility(
     """Radiance that leaves surface points towards the viewer under distant light, with occlusion (ISD15 Eq. 25).
 
     Arguments: `visibility` is a `models.Visibility`, with the `triangle` [...] that each point lies in and its
-    barycentric `weights` [..., 3] there; or SH coefficients [n], one visibility for all points, as
-    `models.cap_visibility` gives them; or [..., n] for each. The others, `mask` too, and what is returned as in
-    `shade_environment`.
+    barycentric `weights` [..., 3] there, or without both where it is that of single points, in their order; or SH
+    coefficients [n], one visibility for all points, as `models.cap_visibility` gives them; or [..., n] for each. The
+    others, `mask` too, and what is returned as in `shade_environment`.
     Light, visibility and lobes may have any degrees: what is integrated is the product of the three expansions, exact
     with all bands of the light up to the sum of the degrees of visibility and lobes.
     Derivatives: in every floating argument: material, light, visibility, weights, frame.
@@ -63,6 +62,8 @@ def shade_environment_visibility(
     check_lobes(lobes, everywhere=True)
     e, _ = _checks.expansion("light_coefficients", light_coefficients)
     vectors = {"normals": normals, "views": views}
+    if isinstance(visibility, Visibility) and triangle is None and weights is None and len(visibility.triangles) == 0:
+        visibility = visibility.coefficients
     if isinstance(visibility, Visibility):
         if triangle is None or weights is None:
             raise ValueError("`triangle` [...] and `weights` [..., 3] are needed: `visibility` is that of a mesh.")

@@ -9,12 +9,11 @@ notation: a = axis; z_l = coefficients of the zonal light; pi_l = sqrt(4 pi/(2l+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from shisd import _checks
 from shisd._numerics import normalize, times
 from shisd._sharding import by_device
-from shisd._typing import Array, Float
+from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import _tables, sh_basis
 from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
 from shisd.shading._surface import shade_points, shade_tiles, sum_lights, surface

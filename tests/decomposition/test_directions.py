@@ -227,7 +227,10 @@ def test_optimizer_improves_a_random_start_and_is_deterministic(dtype):
 def test_the_best_of_several_starts_is_kept(x64):
     starts = [decomposition.random_directions(9, jax.random.key(i)) for i in (3, 5)]
     singular = jnp.asarray(np.repeat(np.eye(3), 3, axis=0))
-    together = decomposition.optimize_directions(jnp.stack([singular, *starts]), 4)
+    told = []
+    stacked = jnp.stack([singular, *starts])
+    together = decomposition.optimize_directions(stacked, 4, progress=lambda *now: told.append(now))
+    assert told == [(i + 1, 9) for i in range(9)]  # three powers for each start
     best = min(float(decomposition.conditioning_loss(decomposition.optimize_directions(z, 4), 4)) for z in starts)
     np.testing.assert_allclose(decomposition.conditioning_loss(together, 4), best, rtol=1e-6)
 
@@ -343,5 +346,7 @@ def test_optimizer_and_loss_refuse_bad_options(as_user):
         decomposition.optimize_directions(z, 4, mirror="w")
     with pytest.raises(ValueError, match="`mirror` needs an odd number of axes.*got 10"):
         decomposition.optimize_directions(decomposition.fibonacci_directions(10), 4, mirror="x")
+    with pytest.raises(ValueError, match=r"`powers` must hold at least one number, all > 0; got \[1.0, nan\]"):
+        decomposition.optimize_directions(z, 4, powers=(1, np.nan))
     with pytest.raises(ValueError, match=r"`bands` must hold at least one degree, none above 4; got \[5\]"):
         decomposition.conditioning_loss(z, 4, bands=(5,))

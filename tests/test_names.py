@@ -1,0 +1,47 @@
+"""What one meets at the prompt: names after `import shisd`, signatures in help texts, printed objects."""
+
+import inspect
+import re
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from shisd import decomposition, domains, filtering, harmonics, models, planning, reference, shading
+
+STAGES = (harmonics, decomposition, domains, models, shading, filtering, planning, reference)
+PUBLIC = {f"{s.__name__}.{name}": thing for s in STAGES for name, thing in vars(s).items() if name[0] != "_"}
+PUBLIC = {name: x for name, x in PUBLIC.items() if callable(x) and getattr(x, "__module__", "").startswith("shisd")}
+
+
+def test_everything_is_there_after_import_and_optional_packages_are_not_loaded():
+    optional = ["matplotlib", "trimesh", "embreex", "OpenEXR", "PIL", "tqdm", "scipy.optimize"]
+    code = f"import sys, shisd; shisd.plotting.show_map, shisd.reference.shade_polygon, shisd.io.read_image\n" \
+           f"print([name for name in {optional} if name in sys.modules])"  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_arrays_have_one_name_in_signatures():
+    shown = str(inspect.signature(models.Visibility.from_mesh))
+    assert shown.startswith("(vertices: ArrayLike, triangles: ArrayLike, degree: int, *, points: Optional[ArrayLike]")
+    assert shown.endswith("progress: Progress = None) -> 'Visibility'")
+    for name, thing in PUBLIC.items():
+        assert "numpy.bool" not in str(inspect.signature(thing)), name
+
+
+def test_objects_show_their_numbers():
+    seen = models.Visibility(np.ones((6, 4), np.float32), np.array([[0, 1, 2]]), 0.5)
+    assert repr(seen) == "Visibility(coefficients=f32[6,4], triangles=[[0, 1, 2]], noise=f32[6])"
+    assert repr(models.CookTorrance(0.25, 1.0, np.array([0.9, 0.5, 0.25], np.float32))).startswith(
+        "CookTorrance(roughness=0.25, metallic=1.0, albedo=[0.9, 0.5, 0.25]"
+    )
+    inside = jax.jit(lambda s: print(repr(s), file=sys.stderr) or s.noise)
+    assert inside(seen).shape == (6,)
+
+
+@pytest.mark.parametrize("status", [decomposition.FitStatus, filtering.FitStatus, harmonics.WindowStatus])
+def test_a_good_status_says_so(status):
+    assert re.fullmatch(r"shisd\.[\w.]+<[A-Z].+\.>", repr(status.ok))
