@@ -124,7 +124,7 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _dering_each(batch: dict[str, Array], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:
+def _dering_each(batch: dict[str, Array], floor: Scalar, degree: int) -> tuple[Array, ...]:
     c = batch["coefficients"]
     each = jax.vmap(lambda c: _dering(c, floor, degree))(c.reshape(math.prod(c.shape[:-1]), c.shape[-1]))
     return tuple(x.reshape(*c.shape[:-1], *x.shape[1:]) for x in each)

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import DTypeLike
 
 from shisd import _checks
@@ -201,8 +202,8 @@ def tabulate_brdf(
     that is tried; not while JAX traces. The result has the dtype of the basis.
     Derivatives: in every parameter of the material and in the lobe directions, both modes. The nodes follow
     `brdf.lobe_width`, through which no derivative passes.
-    Accuracy: `quadrature_error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's format
-    at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in float32,
+    Accuracy: `quadrature_error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's
+    format at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in float32,
     2e-7 for GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1; 4e-4 or
     less for tables in MERL's format at degree 16.
     Cost: 1.8 views x quadrature^2 evaluations of the material; one view's harmonics are in memory at a time.
@@ -236,13 +237,15 @@ def by_convergence(
     rules = (first, 3 * first // 2, 9 * first // 4)
     if quadrature is not None:
         rules = (_checks.integer("quadrature", quadrature, 4),)
-    for nodes in rules:
+    nodes, *finer = rules
+    while True:
         values, error = made(nodes)
-        if isinstance(error, jax.core.Tracer):
+        if isinstance(error, Tracer):
             return (_resolved(values, error, nodes, tolerance) if throw else values), error
         found = float(error)
-        if found <= tolerance or not math.isfinite(found):
+        if found <= tolerance or not math.isfinite(found) or not finer:
             break
+        nodes = finer.pop(0)
     if throw and not math.isfinite(found):
         raise ValueError("`brdf` must be finite; its slices hold NaN or infinity. Look at its parameters.")
     if throw and found > tolerance:
@@ -280,7 +283,7 @@ def slices_at(
     grid = np.meshgrid(theta, phi, indexing="ij")
     sine, cosine = np.sin(grid[0]), np.cos(grid[0])
     local = np.stack([sine * np.cos(grid[1]), sine * np.sin(grid[1]), cosine], axis=-1).astype(dtype)  # [V, A, 3]
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(brdf))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(brdf))
     project = lambda views: _project(brdf, views, degree, quadrature, ridge)
     if progress is None or traced:
         c, changes = project(local.reshape(-1, 3))
@@ -297,9 +300,9 @@ def slices_at(
 
 @eqx.filter_jit
 def _project(
-    brdf: AbstractBrdf, views: Float[ArrayLike, "v 3"], degree: int, quadrature: int, ridge: float | None
+    brdf: AbstractBrdf, views: ArrayLike, degree: int, quadrature: int, ridge: float | None
 ) -> tuple[Float[Array, " v *colour_n"], Float[Array, "v 3 *colour"]]:
-    """Slices for every view, and squared norms of what two steps of the rule change, and of the slices."""
+    """Slices for every view [v, 3], and squared norms of what two steps of the rule change, and of the slices."""
     views = jnp.asarray(views)
     width = jnp.asarray(jax.lax.stop_gradient(brdf.lobe_width), views.dtype)
     fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, brdf)
