@@ -25,5 +25,5 @@ class _Text:
 
 def _shown(leaf: object) -> object:
     if isinstance(leaf, jax.Array | np.ndarray) and leaf.size <= _FEW and not isinstance(leaf, Tracer):
-        return _Text(str(np.vectorize(str, otypes=[object])(leaf).tolist()).replace("'", ""))
+        return _Text(np.array2string(np.asarray(leaf), separator=", "))
     return leaf
