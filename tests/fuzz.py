@@ -48,7 +48,7 @@ def radiance_files(folder: Path) -> list[bytes]:
 
 
 def exr_files(folder: Path) -> list[bytes]:
-    """Each compression, half and float, several parts, layers, deep samples."""
+    """Each compression, half and float, tiles, several parts, layers, deep samples."""
     import OpenEXR
 
     image, flat = pictures()
@@ -62,6 +62,7 @@ def exr_files(folder: Path) -> list[bytes]:
     for name in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"):
         for pixels in (image, flat.astype(np.float16)):
             keep(({"compression": getattr(OpenEXR, f"{name}_COMPRESSION")}, {"RGB": pixels}, ""))
+    keep(({"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}, {"RGB": image}, ""))
     keep(({}, {"Z": image[..., 0]}, "depth"), ({}, {"RGB": image}, "rgb"))
     keep(({}, {f"View.Combined.{c}": image[..., i] for i, c in enumerate("RGB")} | {"Z": image[..., 0]}, ""))
     samples = np.empty((4, 8), object)
@@ -85,11 +86,11 @@ def merl_files(folder: Path) -> list[bytes]:
 
 
 def changed(content: bytes, rng: np.random.Generator) -> bytes:
-    """One to three changes, more of them in the first 400 bytes than elsewhere."""
+    """One or two changes, three of ten in the first 400 bytes."""
     data = bytearray(content)
-    for _ in range(rng.integers(1, 4)):
+    for _ in range(rng.integers(1, 3)):
         size = len(data)
-        at = int(rng.integers(0, min(size, 400) if rng.random() < 0.5 else size)) if size else 0
+        at = int(rng.integers(0, min(size, 400) if rng.random() < 0.3 else size)) if size else 0
         kind, length = rng.integers(8), int(rng.integers(1, 17))
         if kind == 0 and size:
             data[at] ^= 1 << int(rng.integers(8))

@@ -238,7 +238,7 @@ def test_memory_beside_a_large_picture(tmp_path):
     peak = tracemalloc.get_traced_memory()[1] - image.nbytes
     tracemalloc.stop()
     assert image.shape == (height, width, 3) and np.all(image == np.float32(130 * 2.0**-6))
-    assert peak < 40e6, f"{peak / 1e6:.1f} MB"  # 18 MB measured
+    assert peak < 20e6, f"{peak / 1e6:.1f} MB"  # 8 MB measured
 
 
 def test_pixels_that_are_not_square_are_mentioned(tmp_path):

@@ -51,7 +51,7 @@ def write_image(path: StrPath, image: np.ndarray, *, overwrite: bool = False) ->
         raise ValueError(f"{path}: images are written as .png, .exr or .hdr; got suffix {path.suffix!r}.")
     if not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[-1] == 3)) or pixels.size == 0:
         raise ValueError(f"`image` must have shape [H, W] or [H, W, 3]; got {list(pixels.shape)}.")
-    if pixels.dtype.kind not in "fiu":
+    if pixels.dtype.kind not in "fiub":
         raise ValueError(f"`image` must hold real numbers; got {pixels.dtype}.")
     refuse_existing(path, overwrite)
     if suffix == ".png":
