@@ -51,6 +51,7 @@ class Environment(Module):
         source: Literal["shisd", "blender", "mitsuba"] = "shisd",
         up: Literal["y", "z"] | None = None,
         bad_texels: Literal["clamp", "refuse"] = "clamp",
+        layer: str | None = None,
         dtype: DTypeLike = np.float32,
     ) -> "Environment":
         """The map in an OpenEXR or Radiance file (`shisd.io.read_image`), turned as the program `source` shows it.
@@ -63,7 +64,7 @@ class Environment(Module):
           rotate([1, 0, 0], 90): directions are then those of the scene, the middle of the picture is -y. Mitsuba puts
           the first and last rows onto the poles: up to half a texel of difference in theta.
         `up` is the axis that is up in the scene of `source`; by default that of the program itself. A map has its poles
-        on this axis; a texel stays what it is.
+        on this axis; a texel stays what it is. `layer` is that of `read_image`.
 
         Texels that are no radiance are counted: with `bad_texels="clamp"` NaN becomes 0, infinity the largest finite
         value of the map or of half precision, 65504, whichever is more, negative values 0, and a UserWarning gives the
@@ -78,7 +79,7 @@ class Environment(Module):
             raise ValueError(f'`up` must be "z", or "y" of source="mitsuba"; got {up!r} of source={source!r}.')
         if bad_texels not in ("clamp", "refuse"):
             raise ValueError(f'`bad_texels` must be "clamp" or "refuse"; got {bad_texels!r}.')
-        texels = io.read_image(path)
+        texels = io.read_image(path, layer=layer)
         height, width = texels.shape[:2]
         if width != 2 * height:
             raise ValueError(f"{os.fspath(path)}: an environment is twice as wide as high; this is {width} x {height}.")
