@@ -563,8 +563,9 @@ CASES = [
 ]
 BY_NAME = {case.name: case for case in CASES}
 BATCHED = [case for case in CASES if case.batch]
-light_first = lambda cases: [
-    pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.heavy else []) for case in cases
+light_first = lambda cases, stage="": [
+    pytest.param(case, id=case.name, marks=[] if case.name.startswith(stage) and not case.heavy else [pytest.mark.slow])
+    for case in cases
 ]
 
 
@@ -583,6 +584,12 @@ def arguments(case: Case, dtype=np.float32, rows: int | None = None) -> tuple:
     cut = lambda i: lambda a: a[:rows] if i in case.batch and rows is not None else a
     cast = lambda a: jnp.asarray(a, dtype) if floating(a) else jnp.asarray(a)
     return tuple(jax.tree.map(lambda a, i=i: cast(cut(i)(a)), arg) for i, arg in enumerate(stored(case.name)))
+
+
+def one_row(case: Case, inputs: tuple) -> tuple:
+    """The last row of a batch."""
+    last = lambda a: np.asarray(a)[-1]
+    return tuple(jax.tree.map(last, x) if i in case.batch else x for i, x in enumerate(inputs))
 
 
 def over_rows(case: Case) -> Callable:
@@ -654,12 +661,11 @@ def test_precision_and_shapes_are_those_of_the_arguments(case):
         assert shapes(np.float32, 0) == [(0, *s[1:]) if s and s[0] == N else s for s in plain]
 
 
-@pytest.mark.parametrize("case", light_first(CASES))
+@pytest.mark.parametrize("case", light_first(CASES, "harmonics."))
 def test_transformations_change_nothing(case):
     """jit, vmap, lax.map, a loop, and the function as it is called."""
     inputs = arguments(case)
     f = of_batch(case)
-    row = lambda i: tuple(jax.tree.map(lambda a: a[i], x) if n in case.batch else x for n, x in enumerate(inputs))
 
     @jax.jit
     def ways(*inputs):
@@ -677,29 +683,30 @@ def test_transformations_change_nothing(case):
         return results
 
     results = ways(*inputs)
-    plain = f(*inputs)
+    plain = jax.tree.map(np.asarray, f(*inputs) if case.native else results["jit"])
     if case.batch:
-        last = case.function(*row(N - 1))
-        close(last, jax.tree.map(lambda a: a[N - 1] if a.ndim and a.shape[0] == N else a, plain))
+        last = jax.tree.map(lambda a: a[-1] if a.ndim and len(a) == N else a, plain)
+        close(case.function(*one_row(case, inputs)), last)
     for result in results.values():
         close(result, plain)
 
 
-@pytest.mark.parametrize("case", light_first([case for case in BATCHED if case.native]))
+@pytest.mark.parametrize("case", light_first([case for case in BATCHED if case.native], "harmonics."))
 def test_single_and_empty_batches(case):
-    f, plain = case.function, case.function(*arguments(case))
+    f = case.function
+    plain = jax.tree.map(np.asarray, f(*arguments(case)))
     for rows in (1, 0):
-        close(
-            f(*arguments(case, rows=rows)), jax.tree.map(lambda a: a[:rows] if a.ndim and a.shape[0] == N else a, plain)
-        )
+        first = jax.tree.map(lambda a, rows=rows: a[:rows] if a.ndim and a.shape[0] == N else a, plain)
+        close(f(*arguments(case, rows=rows)), first)
 
 
 @pytest.mark.parametrize("case", light_first(CASES))
 def test_forms_of_arrays_change_nothing(case, as_user):
     """Lists, NumPy arrays with strides, of the other byte order, and read-only."""
-    f = of_batch(case)
-    plain = f(*arguments(case))
-    vmapped = case.batch and not case.native
+    f = case.function
+    inputs = stored(case.name) if case.native else one_row(case, stored(case.name))
+    objects = lambda a: jax.tree.map(jnp.asarray, a)
+    plain = f(*objects(inputs))
     forms = {
         "list": lambda a: a.tolist(),
         "strides": lambda a: np.repeat(a, 2, axis=-1)[..., ::2] if a.ndim else a,
@@ -707,10 +714,8 @@ def test_forms_of_arrays_change_nothing(case, as_user):
         "big-endian": lambda a: a.astype(a.dtype.newbyteorder(">")),
     }
     for name, form in forms.items():
-        if vmapped and name == "list":
-            continue  # jax.vmap takes a list as a tree
         try:
-            result = f(*(form(a) if isinstance(a, np.ndarray) and floating(a) else a for a in stored(case.name)))
+            result = f(*(form(a) if isinstance(a, np.ndarray) and floating(a) else objects(a) for a in inputs))
         except Exception as error:
             raise AssertionError(name) from error
         close(result, plain)
