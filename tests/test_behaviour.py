@@ -67,7 +67,8 @@ class Case:
 
     `batch` numbers those that have a leading axis of N rows; `native` says whether the function takes that axis itself
     or by `jax.vmap` alone. `heavy` cases compile for long: their numbers are compared among the slow tests. `idle`
-    names the fields of the objects that rightly do not act on the result; "*" stands for a function without derivatives.
+    names the fields of the objects that rightly do not act on the result, "*" a function without derivatives. `explicit`
+    says whether batches may be sharded over explicit mesh axes, not automatic ones alone.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Case:
     native: bool = True
     heavy: bool = False
     idle: tuple[str, ...] = ()
+    explicit: bool = True
 
 
 RNG = np.random.default_rng(7)
@@ -757,7 +759,8 @@ def test_every_field_acts_and_has_a_gradient(case, x64):
 def test_sharded_batches_are_as_others(case):
     if jax.device_count() < 2:
         pytest.skip("one device; the next test starts this one with two")
-    mesh = jax.make_mesh((2,), ("rows",), axis_types=(jax.sharding.AxisType.Explicit,))
+    kind = jax.sharding.AxisType.Explicit if case.explicit else jax.sharding.AxisType.Auto
+    mesh = jax.make_mesh((2,), ("rows",), axis_types=(kind,))
     place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("rows"))
     inputs = arguments(case)
     split = [jax.device_put(x, place) if i in case.batch else x for i, x in enumerate(inputs)]
