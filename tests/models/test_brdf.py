@@ -189,9 +189,12 @@ def test_conductor_fresnel_is_finite_where_it_has_a_kink(dtype):
     cases = [(1, 1, 0), (0, 1, 0), (0.3, 0.5, 0), (0.75**0.5, 0.5, 0), (0.5, 0, 0), (0, 1.5, 0), (0, 0.2, 3), (1, 0, 0)]
     f = jax.jit(jax.vmap(jax.value_and_grad(_brdf.conductor_fresnel, argnums=(0, 1, 2))))
     value, slopes = f(*(jnp.asarray(column, dtype) for column in np.array(cases).T))
-    assert np.all((value >= -1e-6) & (value <= 1 + 1e-6)), value
+    single = dtype == np.float32
+    np.testing.assert_allclose(value, [0, 1, 1, 1, 1, 1, 1, 1], atol=4e-6 if single else 1e-14)
     assert np.isfinite(slopes).all()
-    np.testing.assert_allclose(value[:3], [0, 1, 1], atol=1e-6)
+    grazing = [-2 * (1 + 1.5**2) / math.sqrt(1.5**2 - 1), (amplitudes(1e-8, 0.2, 3) - 1) / 1e-8]
+    np.testing.assert_allclose(slopes[0][5:7], grazing, rtol=1e-6)
+    assert np.all(np.asarray(slopes)[:, [0, 2, 4]] == 0)
 
 
 @pytest.mark.parametrize("direct", [False, True])
@@ -215,9 +218,9 @@ def test_cook_torrance_is_the_text_of_occt(r, m, direct, rng, x64):
 
 def test_cook_torrance_at_one_pair_worked_by_hand(x64):
     """wi = wo = n: D = 1 / (pi alpha^2), G = 1, F = F0 = 0.04 for ior 1.5: f = 0.04 / (4 pi 0.0625) + 0.96 c / pi."""
-    normal = jnp.array([0, 0, 1.0])
-    got = models.CookTorrance(0.5, 0.0, [0.1, 0.5, 1.0]).value(normal, normal)
-    np.testing.assert_allclose(got, (0.16 + 0.96 * np.array([0.1, 0.5, 1.0])) / math.pi, rtol=1e-12)
+    normal = np.array([[0, 0, 1.0]])
+    got = evaluate(models.CookTorrance(0.5, 0.0, [0.1, 0.5, 1.0]), jnp.asarray(normal), jnp.asarray(normal))
+    np.testing.assert_allclose(got[0], (0.16 + 0.96 * np.array([0.1, 0.5, 1.0])) / math.pi, rtol=1e-12)
 
 
 @pytest.mark.parametrize("colour", range(3))
@@ -263,5 +266,5 @@ def test_sgd_of_extreme_published_rows_stays_finite(rng):
     f = lambda leaves, wi, wo: jax.tree.unflatten(tree, leaves).value(wi, wo)
     both = jax.jit(jax.vmap(jax.value_and_grad(f, argnums=(0, 1, 2)), in_axes=(None, 0, 0)))
     value, slopes = both(leaves, jnp.asarray(wi), jnp.asarray(wo))
-    assert np.isfinite(value).all() and np.all(value >= 0)
+    assert np.isfinite(value).all() and np.all(value >= 0.1 / np.pi * (1 - 1e-6))  # its diffuse part
     assert all(np.isfinite(s).all() for s in jax.tree.leaves(slopes))

@@ -11,7 +11,7 @@ from shisd import decomposition, models, shading
 from tests.models.materials import array, evaluate, hemisphere, spherical
 from tests.truth import scipy_basis
 
-DEGREE = 4
+DEGREE = 3
 
 
 def anisotropic(rng, colour=()):
@@ -49,11 +49,10 @@ def test_value_is_the_sum_over_pairs_of_harmonics(form, rng, dtype):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_it_is_reciprocal_zero_below_the_horizon_and_turns_where_it_says_so(form, rng, x64):
+def test_it_is_zero_below_the_horizon_and_turns_where_it_says_so(form, rng, x64):
     brdf = models.ProjectedBrdf(FORMS[form](rng), isotropic=form)
     wi, wo = hemisphere(rng, 50), hemisphere(rng, 50)
     there = np.asarray(evaluate(brdf, wi, wo))
-    np.testing.assert_allclose(there, evaluate(brdf, wo, wi), atol=1e-14)
     np.testing.assert_array_equal(evaluate(brdf, wi * [1, 1, -1], wo), 0)
     np.testing.assert_array_equal(evaluate(brdf, wi, wo * [1, 1, -1]), 0)
     c, s = np.cos(0.7), np.sin(0.7)
