@@ -19,8 +19,12 @@ proportion to the size. All differences obey recurrences whose sources are diffe
 Then I_l = (P_l'(c . d) T + sum of G (D_l/theta - P_l'(c . d))) / (l (l+1)), with G = theta g and T = sum of G, whose
 leading parts cancel by hand. One formula thus serves every size, in both precisions.
 
-The derivative of an integral is an integral along the moving edges. It has a recurrence of its own and is exact where
-vertices coincide.
+The derivative of an integral in the vertices is an integral along the moving edges. It has a recurrence of its own and
+is exact where vertices coincide. That in the axes is the derivative of the differences: as an integral along the edges,
+which turn back, it would lose a factor 1/h again.
+
+Vertices are unit to rounding only. That tilts short chords b - a, and the sums a + b of nearly opposite vertices, from
+where those of unit vectors lie; `sides` sets both right, and sums over an edge near pi are taken from a + b.
 
 layout: polygons are v[x y z, vertex, p], points p last as vector lanes; axes d[k, x y z]. What belongs to edges is
 [e, p] or [x y z, e, p]; to one edge [p] or [x y z, p], or, for all axes at once, [e, 1, p] or [x y z, e, 1, p].
@@ -382,7 +386,7 @@ def _spans(v: Loop) -> Float[Array, "rows e p"]:
 def sides(v: Loop) -> tuple[Loop, Loop]:
     """Of every edge b - a and a + b, at right angles to each other.
 
-    Lengths that are 1 only to rounding tilt the shorter of the two, the more the shorter it is.
+    Lengths that are 1 to rounding only tilt the shorter of the two, the more the shorter it is.
     """
     end = jnp.roll(v, -1, 1)
     chord, middle = end - v, v + end
@@ -591,7 +595,10 @@ class _Boundary(NamedTuple):
 
 
 def _short(dtype: jnp.dtype) -> float:
-    """Where the leading term of a difference is exact to as many digits as the difference keeps, about."""
+    """Below about which (2l-1) theta the leading term of an odd integral along an edge beats its recurrence.
+
+    The recurrence knows the integral to a rounding of 1, of which (l theta)^2 / 12 is left; the term, to (l theta)^4.
+    """
     return float(2e4 * jnp.finfo(dtype).eps) ** 0.25
 
 

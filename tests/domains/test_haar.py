@@ -9,6 +9,7 @@ from shisd import domains
 from shisd.domains import _haar
 from tests import truth
 from tests.hard_cases import POLYGONS, padded, random_polygon, unit
+from tests.marks import FLOAT64_FIRST
 
 
 def test_orthonormal_and_complete(dtype, rng):
@@ -41,6 +42,7 @@ def test_a_direction_finds_its_cell(rng):
     np.testing.assert_array_equal(basis.evaluate(c, inside), basis.values(c))
 
 
+@FLOAT64_FIRST
 @pytest.mark.parametrize("name", POLYGONS)
 def test_the_share_of_every_cell(name, dtype):
     """Against solid angles of what is left when edges are cut one after another, in extended precision."""

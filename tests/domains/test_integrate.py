@@ -35,14 +35,6 @@ def test_coefficients_and_integrals_of_hard_cases(name, rng):
         assert error < 2 * limit, (dtype.__name__, error)
 
 
-def test_lines_along_edges_agree_with_scipy():
-    """The truth above against SciPy's harmonics in quadrature over the area."""
-    vertices = POLYGONS["non-convex"]
-    w, area = truth.triangle_rule(vertices, 30)
-    by_area = area.astype(float) @ truth.scipy_basis(w.astype(float), 12)
-    np.testing.assert_allclose(truth.edge_coefficients(vertices, 12).astype(float), by_area, atol=1e-13)
-
-
 @pytest.mark.slow
 def test_high_degree_uses_more_axes(x64, rng):
     v = random_polygon(rng, 4, 0.4)
