@@ -62,7 +62,8 @@ def cross(a: Vector, b: Vector) -> Array:
 
 def same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
     """Both in the dtype that they promote to, also where JAX promotes nothing by itself."""
-    dtype = jnp.promote_types(a.dtype, b.dtype)
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.promote_types(a.dtype, b.dtype)
     return a.astype(dtype), b.astype(dtype)
 
 

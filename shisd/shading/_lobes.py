@@ -200,10 +200,10 @@ def tabulate_brdf(
     that is tried; not while JAX traces. The result has the dtype of the basis.
     Derivatives: in every parameter of the material and in the lobe directions, both modes. The nodes follow
     `brdf.lobe_width`, through which no derivative passes.
-    Accuracy: `quadrature_error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's format
-    at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in float32,
-    2e-7 for GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1; 4e-4 or
-    less for tables in MERL's format at degree 16.
+    Accuracy: `quadrature_error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's bins
+    at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in
+    float32, 2e-7 for GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1;
+    4e-4 or less for tables in MERL's bins at degree 16.
     Cost: 1.8 views x quadrature^2 evaluations of the material; one view's harmonics are in memory at a time.
     """
     if not isinstance(brdf, AbstractBrdf):
