@@ -90,8 +90,8 @@ def fit_lobes(
     eps = float(jnp.finfo(w.dtype).eps)
     penalty = jnp.asarray(max(ridge, 8 * starts[0].linear.shape[-1] * eps), w.dtype)
     max_steps = _checks.integer("max_steps", max_steps, 1)
-    tolerance = eps**0.5 if tolerance is None else _checks.number("tolerance", tolerance, positive=True)
-    return _fit(stacked, w, y, areas, penalty, max_steps, tolerance)
+    enough = eps**0.5 if tolerance is None else _checks.number("tolerance", tolerance, positive=True)
+    return _fit(stacked, w, y, areas, penalty, max_steps, enough)
 
 
 @eqx.filter_jit

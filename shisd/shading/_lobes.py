@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
 
 from shisd import _checks
@@ -237,20 +238,18 @@ def by_convergence(
         rules = (_checks.integer("quadrature", quadrature, 4),)
     for nodes in rules:
         values, error = made(nodes)
-        if isinstance(error, jax.core.Tracer):
+        if isinstance(error, Tracer):
             return (_resolved(values, error, nodes, tolerance) if throw else values), error
         found = float(error)
-        if found <= tolerance or not math.isfinite(found):
-            break
-    if throw and not math.isfinite(found):
-        raise ValueError("`brdf` must be finite; its slices hold NaN or infinity. Look at its parameters.")
-    if throw and found > tolerance:
-        raise ValueError(
-            f"The quadrature does not resolve this material: by `quadrature` {nodes} its estimated error is "
-            f"{found:.2g}, above `tolerance` {tolerance:.2g}. Pass `quadrature={3 * nodes // 2}`, a larger "
-            "tolerance, or throw=False and read `quadrature_error`."
-        )
-    return values, error
+        if found <= tolerance or not throw and (nodes == rules[-1] or not math.isfinite(found)):
+            return values, error
+        if not math.isfinite(found):
+            raise ValueError("`brdf` must be finite; its slices hold NaN or infinity. Look at its parameters.")
+    raise ValueError(
+        f"The quadrature does not resolve this material: by `quadrature` {rules[-1]} its estimated error is "
+        f"{found:.2g}, above `tolerance` {tolerance:.2g}. Pass `quadrature={3 * rules[-1] // 2}`, a larger tolerance, "
+        "or throw=False and read `quadrature_error`."
+    )
 
 
 @eqx.filter_jit
@@ -279,7 +278,7 @@ def slices_at(
     grid = np.meshgrid(theta, phi, indexing="ij")
     sine, cosine = np.sin(grid[0]), np.cos(grid[0])
     local = np.stack([sine * np.cos(grid[1]), sine * np.sin(grid[1]), cosine], axis=-1).astype(dtype)  # [V, A, 3]
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(brdf))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(brdf))
     project = lambda views: _project(brdf, views, degree, quadrature, ridge)
     if progress is None or traced:
         c, changes = project(local.reshape(-1, 3))
