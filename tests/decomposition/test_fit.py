@@ -11,6 +11,7 @@ from scipy.integrate import quad
 from scipy.special import eval_legendre
 
 from shisd import decomposition, harmonics, models, shading
+from tests.marks import FLOAT32_FIRST
 from tests.truth import scipy_basis
 
 
@@ -65,6 +66,7 @@ def test_coefficients_add_up_to_the_values(x64, rng):
     np.testing.assert_allclose(jnp.stack(values), lobes.evaluate(w), atol=1e-6)
 
 
+@FLOAT32_FIRST
 def test_zonal_lobes_are_rotated_zonal_harmonics(dtype, rng):
     degree, z = 2, unit(rng.normal(size=(6, 3)))
     weights, w = rng.normal(size=(2, 3, 6)), jnp.asarray(unit(rng.normal(size=(7, 3))), dtype)
@@ -249,6 +251,7 @@ def test_lobes_that_are_one_are_reported(x64):
 # --- sparse weights ---------------------------------------------------------------------------------------------------
 
 
+@FLOAT32_FIRST
 def test_sparse_weights_find_the_axes_of_a_sum_of_few(dtype, rng):
     degree = 4
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
