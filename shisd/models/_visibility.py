@@ -16,6 +16,7 @@ notation: V vertices, or points; F triangles, N rays; v = 1 where light from afa
 """
 
 import functools
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -78,7 +79,7 @@ class Visibility(Module):
 
         It is 0 at vertices inside the mesh, as a mesh that intersects itself has.
         """
-        return self.coefficients[:, 0] / np.sqrt(4 * np.pi)
+        return self.coefficients[:, 0] / math.sqrt(4 * np.pi)
 
     def at(self, triangle: ArrayLike, weights: ArrayLike) -> Float[Array, "*batch n"]:
         """Coefficients at points of the surface: `triangle` [...], its index; barycentric `weights` [..., 3].
@@ -193,7 +194,7 @@ def cap_visibility(axes: ArrayLike, angles: ArrayLike, degree: int) -> Float[Arr
     except ValueError as error:
         raise ValueError(f"`axes` {list(a.shape)} and `angles` {list(angle.shape)} do not broadcast.") from error
     a, angle = jnp.broadcast_to(a, (*shape, 3)).astype(dtype), jnp.broadcast_to(angle, shape).astype(dtype)
-    return (-cap_coefficients(2 * jnp.sin(angle / 2) ** 2, a, degree)).at[..., 0].add(np.sqrt(4 * np.pi))
+    return (-cap_coefficients(2 * jnp.sin(angle / 2) ** 2, a, degree)).at[..., 0].add(math.sqrt(4 * np.pi))
 
 
 def surface_corners(visibility: Visibility, triangle: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
@@ -321,7 +322,7 @@ def _of_hits(hits: Array, local: Float[Array, "r 3"], frames: Float[Array, "v 3 
     hidden = weighted_sums(hits.T.astype(local.dtype) * (4 * np.pi / len(local)), local, degree)
     even = (_tables.bands(degree) + _tables.orders(degree)) % 2 == 0
     hidden = jnp.where(even[:, None], hidden.T, 0)  # n, V
-    return (-rotate_many(hidden[:, None], frames, degree)[:, 0].T).at[:, 0].add(np.sqrt(4 * np.pi))
+    return (-rotate_many(hidden[:, None], frames, degree)[:, 0].T).at[:, 0].add(math.sqrt(4 * np.pi))
 
 
 def _npz(path: str | os.PathLike[str]) -> Path:

@@ -9,6 +9,7 @@ import pytest
 from shisd import decomposition
 from shisd.decomposition import IsotropicBasis, RotatedZonalBasis
 from tests.decomposition import truth
+from tests.marks import FLOAT32_FIRST
 
 DEGREE = 5
 WIDTHS = 3.0 * np.arange(1, 22)
@@ -53,6 +54,7 @@ def check_round_trip(kernel, z, degree, nested, dtype, rng):
     return float(found.condition_number)
 
 
+@FLOAT32_FIRST
 @pytest.mark.parametrize("nested", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["all", "2l+1"])
 @pytest.mark.parametrize("name", KERNELS)
 def test_band_limited_functions_are_reproduced_within_ten_eps_times_the_condition(name, nested, dtype, rng):
@@ -173,7 +175,8 @@ def test_a_zero_function_has_zero_weights_and_no_residual(x64):
 # --- filtering --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["Legendre", "Gaussian"])
+@FLOAT32_FIRST
+@pytest.mark.parametrize("name", [pytest.param("Legendre", marks=pytest.mark.slow), "Gaussian"])
 def test_filtering_is_the_integral_of_signal_times_turned_kernel(name, dtype, rng):
     basis = IsotropicBasis(KERNELS[name](), decomposition.separate_directions(DEGREE), DEGREE)
     c = rng.standard_normal((4, 1, 36)).astype(dtype)

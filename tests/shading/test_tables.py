@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from shisd import decomposition, models, shading
+from shisd.shading import _views
 from shisd.shading._lobes import by_convergence
 from tests.models.materials import hemisphere_rule
 from tests.truth import scipy_basis
@@ -37,6 +38,16 @@ def slices():
         values = masking(w) * masking(wo) / (4 * wo[2] * np.pi * ALPHA**2 * cos4 * (1 + tangent2) ** 2)
         found.append((values * area) @ scipy_basis(w, DEGREE))
     return np.array(found)
+
+
+def test_splines_follow_functions_of_the_elevation():
+    """sin^k cos, of the parity that components of order k have."""
+    k, theta = np.arange(5)[:, None], np.linspace(0, np.pi / 2, 50, dtype=np.float32)
+    function = lambda theta: (np.sin(theta) ** k * np.cos(theta)).astype(np.float32)
+    table = _views.spline_table(jnp.asarray(function(_views.elevations(16))), k[:, 0])
+    got = np.asarray(table @ _views.spline_weights(jnp.asarray(theta), 16)) * np.where(k > 0, np.sin(theta), 1)
+    error = np.max(np.abs(got - function(theta)))
+    assert error < 1e-3  # 3.4e-4, near the horizon
 
 
 def test_the_stated_error_is_that_of_the_table():
