@@ -29,10 +29,10 @@ def scene(rng, count, dtype):
 
 @FLOAT32_FIRST
 @pytest.mark.parametrize(
-    "material", ["glossy", *(pytest.param(m, marks=pytest.mark.slow) for m in MATERIALS if m != "glossy")]
+    "material", ["smooth", *(pytest.param(m, marks=pytest.mark.slow) for m in MATERIALS)]
 )
 def test_it_is_the_light_of_these_coefficients(material, dtype, rng):
-    lobes = tabulate(MATERIALS[material])
+    lobes = random_lobes(DEGREE, dtype) if material == "smooth" else tabulate(MATERIALS[material])
     axis, z, *where = scene(rng, 200, dtype)
     where[1][0], where[0][1] = where[0][0], axis  # a view along the normal, a normal along the axis
     e = harmonics.convolve(harmonics.sh_basis(axis, DEGREE)[None], z)
@@ -59,7 +59,7 @@ def test_several_lights_add_up(dtype, rng):
     np.testing.assert_allclose(got, expected, atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)))
 
 
-def test_eq_24_and_reflection_maps(x64, rng):
+def test_eq_24(x64, rng):
     lobes = random_lobes(DEGREE, np.float64)
     axis, z, normals, views, _ = scene(rng, 6, np.float64)
     got = shading.shade_zonal(lobes, axis, z[0], normals, views)
@@ -70,10 +70,6 @@ def test_eq_24_and_reflection_maps(x64, rng):
         p = np.polynomial.legendre.legvander(np.asarray(world) @ unit(axis), DEGREE)  # y_l^0 pi_l = P_l
         weights = lobes.slice_weights(jnp.array([np.sqrt(1 - (view @ normal) ** 2), 0, view @ normal]))
         np.testing.assert_allclose(value, np.sum(np.asarray(weights) * z[0][:, None] * p.T), rtol=1e-9)
-    e = harmonics.convolve(harmonics.sh_basis(axis, DEGREE), z[0])
-    maps = shading.prefilter(lobes, e, tolerance=1e-3)
-    error = np.asarray(shading.shade_prefiltered(maps, normals, views)) - got
-    assert np.sqrt(np.mean(error**2)) < 5e-3 * np.sqrt(np.mean(np.square(got)))
 
 
 @pytest.mark.slow
@@ -86,7 +82,7 @@ def test_derivatives(x64, rng):
 
 def test_errors_name_the_argument(as_user, rng):
     axis, z, normals, views, _ = scene(rng, 2, np.float32)
-    lobes = tabulate(MATERIALS["glossy"])
+    lobes = random_lobes(DEGREE, np.float32)
     with pytest.raises(ValueError, match=r"`axis` must have shape \[3\], or \[S, 3\] for S lights; got \[1, 1, 3\]"):
         shading.shade_zonal(lobes, axis[None, None], z, normals, views)
     with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape \[L\+1\]"):

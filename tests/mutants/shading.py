@@ -1,0 +1,113 @@
+"""Mutants of shading by lights and distant light: what the tests named have to catch."""
+
+from tests.mutants import Mutant
+
+POLYGON, SURFACE = "tests/shading/test_polygon.py::", "tests/shading/test_surface.py::"
+MIRROR = "tests/shading/test_mirror.py::"
+SLICE = POLYGON + "test_values_and_gradients_of_the_slice[float32]"
+
+MUTANTS = [
+    Mutant(
+        "outline gradients of radiance are zero", "shisd/shading/_incidence.py",
+        old="return jax.jvp(lambda v: _fold(rows, v, degree, spare), (v,), (by,))[1]",
+        new="return 0 * jax.jvp(lambda v: _fold(rows, v, degree, spare), (v,), (by,))[1]", test=SLICE,
+    ),
+    Mutant(
+        "outline gradients of integrals are zero", "shisd/domains/_moments.py",
+        old="change -= _sum_first(speed * weight)", new="change -= 0 * _sum_first(speed * weight)", test=SLICE,
+    ),
+    Mutant(
+        "the plane of incidence does not turn with the view", "shisd/shading/_incidence.py",
+        old="dv += back * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]", new="dv += 0 * back",
+        test=SLICE,
+    ),
+    Mutant(
+        "slices do not change with the elevation of the view", "shisd/shading/_incidence.py",
+        old="* (view[:, 2] * along - jnp.sin(theta) * dz)", new="* (0 * along)", test=SLICE,
+    ),
+    Mutant(
+        "frames do not turn with the normal", "shisd/shading/_surface.py",
+        old="return r, jnp.cross(jnp.cross(normal, dn)[:, :, None], r, axis=1)", new="return r, 0 * r", test=SLICE,
+    ),
+    Mutant(
+        "no clip at the horizon", "shisd/shading/_polygon.py",
+        old="whole, lambda: clip(outline, above))", new="whole, whole)", test=SLICE,
+    ),
+    Mutant(
+        "a light's plane from absolute coordinates", "shisd/shading/_polygon.py",
+        old="edges = light.points - light.points[:1]", new="edges = light.points",
+        test=POLYGON + "test_far_from_the_origin[4e+06]",
+    ),
+    Mutant(
+        "lights are seen from behind", "shisd/shading/_polygon.py",
+        old="jnp.minimum(side, 0)", new="jnp.maximum(side, 0)", test=POLYGON + "test_several_lights",
+    ),
+    Mutant(
+        "only the first light of a kind", "shisd/shading/_surface.py",
+        old="if len(jax.tree.leaves(stack)[0]) == 1:", new="if len(jax.tree.leaves(stack)[0]) >= 1:",
+        test=POLYGON + "test_several_lights",
+    ),
+    Mutant(
+        "no gradient through a portal's light", "shisd/shading/_polygon.py",
+        old="else product_matrices(incident,", new="else product_matrices(jax.lax.stop_gradient(incident),",
+        test=POLYGON + "test_a_portal_is_the_light_behind_it",
+    ),
+    Mutant(
+        "projected lights have no emission", "shisd/shading/_polygon.py",
+        old="_constant_radiance(light)[..., None])", new="jnp.ones_like(_constant_radiance(light)[..., None]))",
+        test=POLYGON + "test_projected_light",
+    ),
+    Mutant(
+        "NaN is dark", "shisd/shading/_surface.py",
+        old="jnp.where(jnp.isfinite(mark), 0, jnp.nan) * mark", new="jnp.zeros_like(mark)",
+        test=SURFACE + "test_nan_stays_nan[polygon]",
+    ),
+    Mutant(
+        "masked points are shaded first", "shisd/shading/_surface.py",
+        old="jnp.where(mask, a, jax.lax.stop_gradient(other[name])[None])", new="a",
+        test=SURFACE + "test_masks[environment]",
+    ),
+    Mutant(
+        "a view on the horizon sees", "shisd/shading/_surface.py",
+        old="seen = (local[:, 2] > 0)", new="seen = (local[:, 2] >= 0)",
+        test=SURFACE + "test_a_view_on_the_horizon_sees_nothing[environment]",
+    ),
+    Mutant(
+        "rounding noise is a tangent", "shisd/shading/_surface.py",
+        old="_PARALLEL = 100 ", new="_PARALLEL = 0.01 ", test=SURFACE + "test_a_tangent_along_the_normal_is_no_frame",
+    ),
+    Mutant(
+        "every number of points is a size", "shisd/shading/_surface.py",
+        old="else octave // 16", new="else 1", test=SURFACE + "test_a_new_number_of_points_compiles_nothing_heavy",
+    ),
+    Mutant(
+        "light turned the wrong way", "shisd/shading/_environment.py",
+        old="to_local = jnp.swapaxes(frame, 1, 2)", new="to_local = frame",
+        test="tests/shading/test_environment.py::test_radiance_is_equation_22[float32-diffuse]",
+    ),
+    Mutant(
+        "norms of zonal light", "shisd/shading/_zonal.py",
+        old="z = (z / jnp.broadcast_to(", new="z = (z * jnp.broadcast_to(",
+        test="tests/shading/test_zonal.py::test_eq_24",
+    ),
+    Mutant(
+        "near balls are as far ones", "shisd/models/_light.py",
+        old="sine2 / (1 + jnp.sqrt(1 - sine2))", new="sine2 / 2",
+        test="tests/shading/test_sphere.py::test_zonal_coefficients_are_integrals_over_the_cap[float32]",
+    ),
+    Mutant(
+        "round footprints too wide", "shisd/shading/_mirror.py",
+        old="jnp.exp(-half * variance[None])", new="jnp.exp(-1.1 * half * variance[None])",
+        test=MIRROR + "test_filters_against_quadrature[float32-False]",
+    ),
+    Mutant(
+        "footprints do not lie askew", "shisd/shading/_mirror.py",
+        old="2 * cos * sin @ xy[None]", new="cos * sin @ xy[None]",
+        test=MIRROR + "test_filters_against_quadrature[float32-True]",
+    ),
+    Mutant(
+        "footprints do not see the view change", "shisd/shading/_footprint.py",
+        old="dx = distance[..., None] * (d_ray - ray[..., None] * slope)", new="dx = distance[..., None] * d_ray",
+        test=MIRROR + "test_footprints_from_images_are_derivatives_of_the_mirror_direction[plane-float64]",
+    ),
+]  # fmt: skip
