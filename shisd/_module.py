@@ -25,5 +25,9 @@ class _Text:
 
 def _shown(leaf: object) -> object:
     if isinstance(leaf, jax.Array | np.ndarray) and leaf.size <= _FEW and not isinstance(leaf, Tracer):
-        return _Text(str(np.vectorize(str, otypes=[object])(leaf).tolist()).replace("'", ""))
+        return _Text(_numbers(np.asarray(leaf)))
     return leaf
+
+
+def _numbers(array: np.ndarray | np.generic) -> str:
+    return f"[{', '.join(map(_numbers, array))}]" if array.ndim else str(array[()])
