@@ -1,5 +1,7 @@
 """The base of the package's objects: a module of Equinox that shows its numbers when it is printed."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -29,5 +31,5 @@ def _shown(leaf: object) -> object:
     return leaf
 
 
-def _numbers(array: np.ndarray | np.generic) -> str:
+def _numbers(array: Any) -> str:
     return f"[{', '.join(map(_numbers, array))}]" if array.ndim else str(array[()])
