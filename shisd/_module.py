@@ -1,5 +1,7 @@
 """The base of the package's objects: a module of Equinox that shows its numbers when it is printed."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -25,5 +27,9 @@ class _Text:
 
 def _shown(leaf: object) -> object:
     if isinstance(leaf, jax.Array | np.ndarray) and leaf.size <= _FEW and not isinstance(leaf, Tracer):
-        return _Text(np.array2string(np.asarray(leaf), separator=", "))
+        return _Text(_numbers(np.asarray(leaf)))
     return leaf
+
+
+def _numbers(array: Any) -> str:
+    return f"[{', '.join(map(_numbers, array))}]" if array.ndim else str(array[()])

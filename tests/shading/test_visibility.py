@@ -169,7 +169,7 @@ def test_rays_find_a_wall_with_the_noise_that_they_state():
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-@pytest.mark.parametrize("far", [0.0, 1e3, 1e5])
+@pytest.mark.parametrize("far", [0.0, 1e3, 1e5, 1e7])
 def test_neither_place_nor_unit_matters(far, scale):
     move = lambda points: (points + far * np.array([1, -0.6, 0.3])) * scale
     points, faces = ball()
