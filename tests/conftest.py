@@ -7,7 +7,7 @@ import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_disable_most_optimizations", True)  # values are judged here, and compiling takes most of the time
+jax.config.update("jax_disable_most_optimizations", True)  # most of the time is compiling
 
 _HOOK = jaxtyping.install_import_hook("shisd", "beartype.beartype")  # before the package is imported anywhere
 
