@@ -156,7 +156,7 @@ CASES = [
     Case("harmonics.evaluate", harmonics.evaluate, lambda: (normal(9), W), (1,)),
     Case(
         "harmonics.project",
-        lambda a: harmonics.project(lambda w: a * w[..., 2] ** 2, 2),
+        lambda a: harmonics.project(lambda w: a * w[..., 2].astype(a.dtype) ** 2, 2),
         lambda: (W[:, 0],),
         (0,),
         False,
@@ -688,7 +688,7 @@ def test_transformations_change_nothing(case):
     plain = jax.tree.map(np.asarray, f(*inputs) if case.native else results["jit"])
     if case.batch:
         last = jax.tree.map(lambda a: a[-1] if a.ndim and len(a) == N else a, plain)
-        close(case.function(*one_row(case, inputs)), last)
+        close(case.function(*jax.tree.map(jnp.asarray, one_row(case, inputs))), last)
     for result in results.values():
         close(result, plain)
 
