@@ -103,13 +103,12 @@ def test_clipping_at_the_limits(dtype):
     polygon, up = domains.SphericalPolygon(v), unit(v.sum(axis=0)).astype(dtype)
     whole = domains.clip_to_hemisphere(polygon, up)
     np.testing.assert_allclose(domains.solid_angle(whole), domains.solid_angle(polygon), rtol=1e-6)
-    for largest in (2 * np.pi, 4 * np.pi):
-        nothing = lambda v: domains.solid_angle(
-            domains.clip_to_hemisphere(domains.SphericalPolygon(v, largest=largest), -up)  # noqa: B023
-        )
-        value, slope = jax.value_and_grad(nothing)(jnp.asarray(v))
-        assert value == 0
-        np.testing.assert_array_equal(slope, 0)
+    nothing = lambda v: domains.solid_angle(
+        domains.clip_to_hemisphere(domains.SphericalPolygon(v, largest=4 * np.pi), -up)
+    )
+    value, slope = jax.value_and_grad(nothing)(jnp.asarray(v))
+    assert value == 0
+    np.testing.assert_array_equal(slope, 0)
 
 
 @pytest.mark.slow
