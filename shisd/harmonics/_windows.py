@@ -120,7 +120,8 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
     windowed, strength, hopeless = by_device(_dering_each, {"coefficients": c}, floor, degree)
     status = WindowStatus.where(jnp.any(hopeless), WindowStatus.mean_below_floor, WindowStatus.ok)
     if throw:
-        windowed, strength = status.error_if((windowed, strength), jnp.any(hopeless))
+        message = WindowStatus[WindowStatus.mean_below_floor]
+        windowed, strength = _checks.require((windowed, strength), ~jnp.any(hopeless), message)
     return Deringed(windowed, strength, status)
 
 
