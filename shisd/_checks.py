@@ -6,7 +6,7 @@ Shapes, types and static arguments are known while tracing, so these checks cost
 import math
 import numbers
 import operator
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from shisd._typing import Array
+
+T = TypeVar("T")
 
 
 def any_array(name: str, value: ArrayLike) -> Array:
@@ -110,7 +112,7 @@ def integer(name: str, value: object, minimum: int = 0) -> int:
     return number
 
 
-def require(value: Any, good: ArrayLike, message: str) -> Any:
+def require(value: T, good: Any, message: str) -> T:
     """`value`, where all of `good` is true. Where it is not, a ValueError at once, or under jit an error at run time.
 
     What is known is judged here and not by `eqx.error_if`, whose message stands among twenty lines of others.
