@@ -6,6 +6,7 @@ Shapes, types and static arguments are known while tracing, so these checks cost
 import math
 import numbers
 import operator
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ import numpy as np
 from jax.core import Tracer
 
 from shisd._typing import Array, ArrayLike
+
+T = TypeVar("T")
 
 
 def any_array(name: str, value: ArrayLike) -> Array:
@@ -108,7 +111,7 @@ def integer(name: str, value: object, minimum: int = 0) -> int:
     return number
 
 
-def require(value: Array, good: ArrayLike, message: str) -> Array:
+def require(value: T, good: Any, message: str) -> T:
     """`value`, where all of `good` is true. Where it is not, a ValueError at once, or under jit an error at run time.
 
     What is known is judged here and not by `eqx.error_if`, whose message stands among twenty lines of others.

@@ -50,9 +50,9 @@ def lanczos_window(degree: int, width: ArrayLike | None = None) -> Float[Array, 
 
 def _ratio(degree: int, width: ArrayLike | None) -> Float[Array, " bands"]:
     degree = _checks.degree(degree)
-    width = _checks.scalar("width", degree + 1 if width is None else width)
-    width = _checks.require(width, width > 0, "`width` must be > 0.")
-    return jnp.arange(degree + 1).astype(width.dtype) / jnp.broadcast_to(width, (degree + 1,))
+    w = _checks.scalar("width", degree + 1 if width is None else width)
+    w = _checks.require(w, w > 0, "`width` must be > 0.")
+    return jnp.arange(degree + 1).astype(w.dtype) / jnp.broadcast_to(w, (degree + 1,))
 
 
 def laplacian_window(degree: int, strength: ArrayLike) -> Float[Array, " bands"]:
@@ -63,9 +63,9 @@ def laplacian_window(degree: int, strength: ArrayLike) -> Float[Array, " bands"]
     Derivatives: in `strength`, every order.
     Source: Sloan 2008.
     """
-    degree, strength = _checks.degree(degree), _checks.scalar("strength", strength)
-    strength = _checks.require(strength, strength >= 0, "`strength` must be >= 0.")
-    return 1 / (1 + strength * jnp.asarray(_curvature(degree), strength.dtype))
+    degree, s = _checks.degree(degree), _checks.scalar("strength", strength)
+    s = _checks.require(s, s >= 0, "`strength` must be >= 0.")
+    return 1 / (1 + s * jnp.asarray(_curvature(degree), s.dtype))
 
 
 def apply_window(coefficients: ArrayLike, window: ArrayLike) -> Float[Array, "*batch n"]:
@@ -119,7 +119,8 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
     windowed, strength, hopeless = by_device(_dering_each, {"coefficients": c}, floor, degree)
     status = WindowStatus.where(jnp.any(hopeless), WindowStatus.mean_below_floor, WindowStatus.ok)
     if throw:
-        windowed, strength = status.error_if((windowed, strength), jnp.any(hopeless))
+        message = WindowStatus[WindowStatus.mean_below_floor]
+        windowed, strength = _checks.require((windowed, strength), ~jnp.any(hopeless), message)
     return Deringed(windowed, strength, status)
 
 
@@ -127,7 +128,8 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
 def _dering_each(batch: dict[str, Array], floor: Scalar, degree: int) -> tuple[Array, ...]:
     c = batch["coefficients"]
     each = jax.vmap(lambda c: _dering(c, floor, degree))(c.reshape(math.prod(c.shape[:-1]), c.shape[-1]))
-    return tuple(x.reshape(*c.shape[:-1], *x.shape[1:]) for x in each)
+    windowed, strength, hopeless = (x.reshape(*c.shape[:-1], *x.shape[1:]) for x in each)
+    return windowed, strength, hopeless
 
 
 def _dering(c: Float[Array, " n"], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:

@@ -118,6 +118,7 @@ def test_round_trips(dtype, rng, source, target):
     np.testing.assert_allclose(jnp.linalg.norm(there), jnp.linalg.norm(c), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_jit_and_vmap(x64, rng):
     c = jnp.asarray(rng.normal(size=(2, 16)))
     for target in ("unsigned", "e3nn"):

@@ -137,8 +137,8 @@ MUTANTS = [
     Mutant(
         "windows of any width",
         "shisd/harmonics/_windows.py",
-        old='_checks.require(width, width > 0, "`width` must be > 0.")',
-        new="width",
+        old='_checks.require(w, w > 0, "`width` must be > 0.")',
+        new="w",
         test="tests/harmonics/test_windows.py::test_widths_and_strengths_that_are_none_are_refused",
     ),
     Mutant(
