@@ -108,7 +108,7 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
     lobes = {}
     for name, degree in DEGREES.items():
         basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-        lobes[name] = shading.tabulate_brdf(brdfs[name], basis, domain="upper", quadrature=64)
+        lobes[name] = shading.tabulate_brdf(brdfs[name], basis, domain="upper")
 
     images, truths, rows = {}, {}, []
     names = [*lights(), "window"]

@@ -42,7 +42,7 @@ def material() -> models.AbstractBrdf:
 
 def tabulate(degree: int) -> shading.Lobes:
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-    return shading.tabulate_brdf(material(), basis, quadrature=64)
+    return shading.tabulate_brdf(material(), basis)
 
 
 def make_scene(path: Path, degree: int, pixels: int) -> None:

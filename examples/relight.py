@@ -8,7 +8,6 @@ scene, whose own error is known and taken off. Writes pictures, false-colour err
 """
 
 import csv
-import functools
 import itertools
 import tempfile
 import time
@@ -120,12 +119,11 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
 
     # One table of lobes per material serves every degree: light without high bands does not see those of the lobes.
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(max(degrees)), max(degrees))
-    tabulate = functools.partial(shading.tabulate_brdf, basis=basis, quadrature=64, tolerance=1e-2)
 
     with ThreadPoolExecutor(2) as pool:
         truths = dict(zip(jobs, tqdm(pool.map(integrate, jobs), "Monte Carlo", len(jobs)), strict=True))
 
-    lobes = {name: tabulate(brdf) for name, brdf in tqdm(brdfs.items(), "lobes")}
+    lobes = {name: shading.tabulate_brdf(brdf, basis) for name, brdf in tqdm(brdfs.items(), "lobes")}
     cases = list(itertools.product(brdfs, environments, degrees))
 
     def shade(case):
