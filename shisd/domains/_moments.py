@@ -23,8 +23,8 @@ The derivative of an integral in the vertices is an integral along the moving ed
 is exact where vertices coincide. That in the axes is the derivative of the differences: as an integral along the edges,
 which turn back, it would lose a factor 1/h again.
 
-Vertices are unit to rounding only. That tilts short chords b - a, and the sums a + b of nearly opposite vertices, from
-where those of unit vectors lie; `sides` sets both right, and sums over an edge near pi are taken from a + b.
+Vertices are unit to rounding only, which tilts the sum a + b of nearly opposite ones; `sides` sets it right, and what
+is a sum over the ends of an edge near pi is taken from it.
 
 layout: polygons are v[x y z, vertex, p], points p last as vector lanes; axes d[k, x y z]. What belongs to edges is
 [e, p] or [x y z, e, p]; to one edge [p] or [x y z, p], or, for all axes at once, [e, 1, p] or [x y z, e, 1, p].
@@ -384,16 +384,15 @@ def _spans(v: Loop) -> Float[Array, "rows e p"]:
 
 
 def sides(v: Loop) -> tuple[Loop, Loop]:
-    """Of every edge b - a and a + b, at right angles to each other.
+    """Of every edge b - a and a + b, these at right angles to those.
 
-    Lengths that are 1 to rounding only tilt the shorter of the two, the more the shorter it is.
+    Of nearly opposite vertices, whose lengths are 1 to rounding only, the sum as it stands is tilted.
     """
     end = jnp.roll(v, -1, 1)
     chord, middle = end - v, v + end
     chord2, middle2 = dot(chord, chord), dot(middle, middle)
-    tilt, short = dot(chord, middle) / jnp.maximum(chord2, middle2), chord2 < middle2
-    upright = chord - jnp.where(short, tilt, 0)[None] * middle
-    return upright, middle - jnp.where(short, 0, tilt)[None] * chord
+    tilt = jnp.where(chord2 < middle2, 0, dot(chord, middle) / jnp.maximum(chord2, middle2))
+    return chord, middle - tilt[None] * chord
 
 
 def _turns(start: Loop, chord: Loop, middle: Loop) -> tuple[Array, Array, Array, Loop]:

@@ -67,7 +67,7 @@ LIMITS = {  # float32 and float64, of the polygon as float32 has it: values, der
     "solid angle 2e-12": ((2e-06, 1e-05, 1e-05), (7e-11, 5e-10, 9e-11)),
     "vertex at the axis": ((1e-06, 3e-05, 9e-06), (4e-15, 4e-14, 8e-13)),
     "vertex opposite to the axis": ((1e-06, 2e-05, 1e-04), (4e-15, 3e-14, 4e-13)),
-    "axis in the plane of an edge": ((4e-07, 2e-07, 2e-06), (3e-15, 5e-15, 2e-13)),
+    "axis in the plane of an edge": ((4e-07, 8e-07, 2e-06), (3e-15, 5e-15, 2e-13)),
     "axis on an edge": ((3e-07, 2e-05, 9e-07), (3e-15, 3e-15, 2e-12)),
     "axis normal to an edge": ((2e-07, 2e-06, 1e-05), (3e-15, 3e-15, 2e-13)),
 }
