@@ -108,6 +108,6 @@ MUTANTS = [
     Mutant(
         "footprints do not see the view change", "shisd/shading/_footprint.py",
         old="dx = distance[..., None] * (d_ray - ray[..., None] * slope)", new="dx = distance[..., None] * d_ray",
-        test=MIRROR + "test_footprints_from_images_are_derivatives_of_the_mirror_direction[plane-float64]",
+        test=MIRROR + "test_footprints_from_images_are_derivatives_of_the_mirror_direction[sphere-float64]",
     ),
 ]  # fmt: skip
