@@ -14,6 +14,7 @@ z = the smooth logarithm, P = penalty of each cosine wave.
 """
 
 import functools
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -204,7 +205,7 @@ def _coverage(wi: Array, wo: Array, used: Array, degree: int, isotropic: bool) -
     u = (0.5 + np.arange(1, _PROBES + 1)[:, None] * steps) % 1
     polar, azimuth = np.arcsin(np.sqrt(u[:, :2])), 2 * np.pi * u[:, 2:]
     probes = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-    least = np.cos(np.pi / (2 * degree + 2))
+    least = math.cos(np.pi / (2 * degree + 2))
     a, b = (_turned(wi, wo), _turned(wo, wi)) if isotropic else ((wi, wo), (wo, wi))
 
     def near(pair: Float[Array, "2 3"]) -> Array:

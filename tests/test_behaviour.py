@@ -119,7 +119,7 @@ gaussians = lambda: decomposition.GaussianLobes(W[:2], np.array([2, 5], np.float
 stack = lambda objects: jax.tree.map(lambda *leaves: np.stack(leaves), *objects)
 polygons = lambda: stack([domains.SphericalPolygon(t) for t in TRIANGLES])
 panel = lambda: models.PolygonLight(PANEL, np.ones(3, np.float32))
-portal = lambda: models.PortalLight(PANEL, normal(3, 9), 2)
+portal = lambda: models.PortalLight(PANEL, normal(3, 9))
 ball = lambda: models.SphereLight(np.array([0, 0.5, 2], np.float32), 0.5, np.ones(3, np.float32))
 blocks = lambda: shading.BrdfMatrix(
     tuple(jnp.asarray(normal(3, 3 - m, 3 - m)) for m in range(3)), jnp.zeros((), np.float32), 2, 2, True

@@ -160,12 +160,9 @@ def optimize_directions(
         raise ValueError(f"`mirror` must be None, 'x', 'y' or 'z'; got {mirror!r}.")
     if mirror is not None and starts.shape[-2] % 2 == 0:
         raise ValueError(f"`mirror` needs an odd number of axes: one in the plane, and pairs; got {starts.shape[-2]}.")
-    levels = [float(power) for power in powers]
-    if not levels or not all(power > 0 for power in levels):
-        raise ValueError(f"`powers` must hold at least one number, all > 0; got {levels}.")
     steps, plane = _checks.integer("max_steps", max_steps, 1), None if mirror is None else "xyz".index(mirror)
-    powers = tuple(_checks.number("powers", power, positive=True) for power in powers)
-    if not powers:
+    levels = [_checks.number("powers", power, positive=True) for power in powers]
+    if not levels:
         raise ValueError("`powers` must hold at least one power.")
     starts = normalize(starts if several else starts[None])
     found, losses = [], []

@@ -55,9 +55,9 @@ class HaarBasis(Module):
         s *= jnp.asarray(1 / np.sqrt(self.areas), s.dtype).reshape((1,) * (s.ndim - 1) + (-1,))
         details = []
         for level in reversed(range(self.levels)):
-            parts = jnp.einsum("...pc,pdc->...pd", s.reshape(*s.shape[:-1], -1, 4), _reflections(level, s.dtype))
+            parts = jnp.einsum("...pc,pdc->...pd", s.reshape(*s.shape[:-1], s.shape[-1] // 4, 4), _reflections(level, s.dtype))
             s = parts[..., 0]
-            details.append(parts[..., 1:].reshape(*s.shape[:-1], -1))
+            details.append(parts[..., 1:].reshape(*s.shape[:-1], 3 * s.shape[-1]))
         return jnp.concatenate([s, *reversed(details)], axis=-1)
 
     def values(self, coefficients: ArrayLike) -> Float[Array, "*batch n"]:
@@ -69,7 +69,7 @@ class HaarBasis(Module):
             details = c[..., used : used + 3 * cells].reshape(*c.shape[:-1], cells, 3)
             parts = jnp.concatenate([s[..., None], details], axis=-1)
             parts = jnp.einsum("...pc,pdc->...pd", parts, _reflections(level, c.dtype))
-            s, used = parts.reshape(*c.shape[:-1], -1), used + 3 * cells
+            s, used = parts.reshape(*c.shape[:-1], 4 * cells), used + 3 * cells
         return s * jnp.asarray(1 / np.sqrt(self.areas), s.dtype).reshape((1,) * (s.ndim - 1) + (-1,))
 
     def evaluate(self, coefficients: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:

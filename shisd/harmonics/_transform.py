@@ -14,6 +14,7 @@ parity of l), r = 0 for cos(m phi) and 1 for sin(m phi), f = one of several func
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -125,7 +126,7 @@ def _by_rule(function: Callable[[Array], ArrayLike], degree: int, rule: int) -> 
         raise ValueError(
             f"`function` must return [{directions.shape[0]}, *colour] for as many directions; got {list(values.shape)}."
         )
-    scale = jnp.tensordot(weights.astype(values.dtype), jnp.abs(values), 1) / np.sqrt(4 * np.pi)
+    scale = jnp.tensordot(weights.astype(values.dtype), jnp.abs(values), 1) / math.sqrt(4 * math.pi)
     return analyse(values.reshape(rule // 2 + 1, rule + 1, *values.shape[1:]), "gauss", degree), scale
 
 

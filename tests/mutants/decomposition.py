@@ -34,8 +34,8 @@ MUTANTS = [
     Mutant(
         "a singular start of directions reversed",
         "shisd/decomposition/_directions.py",
-        old="found, z), None  # False for NaN",
-        new="found, -z), None",
+        old="return jnp.where(after < before, found, free)",
+        new="return jnp.where(after < before, found, -free)",
         test="tests/decomposition/test_directions.py::test_optimizer_returns_a_singular_start_as_it_is",
     ),
     Mutant(
