@@ -55,7 +55,8 @@ class HaarBasis(Module):
         s *= jnp.asarray(1 / np.sqrt(self.areas), s.dtype).reshape((1,) * (s.ndim - 1) + (-1,))
         details = []
         for level in reversed(range(self.levels)):
-            parts = jnp.einsum("...pc,pdc->...pd", s.reshape(*s.shape[:-1], s.shape[-1] // 4, 4), _reflections(level, s.dtype))
+            s = s.reshape(*s.shape[:-1], s.shape[-1] // 4, 4)
+            parts = jnp.einsum("...pc,pdc->...pd", s, _reflections(level, s.dtype))
             s = parts[..., 0]
             details.append(parts[..., 1:].reshape(*s.shape[:-1], 3 * s.shape[-1]))
         return jnp.concatenate([s, *reversed(details)], axis=-1)
