@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import _checks
-from shisd._numerics import dot, times
+from shisd._numerics import dot, normalize, times
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.domains import HaarBasis
@@ -229,15 +229,15 @@ def _project(
         sign, v = _facing(light, relative), on_sphere(relative)
         if isinstance(basis, HaarBasis):
             v = clip_to_cells(v, basis.levels)
-        angle = loop_solid_angle(v, 2 * np.pi)
-        if isinstance(basis, HaarBasis):
+            angle = loop_solid_angle(v, 2 * np.pi)
             integrals = incident @ loop_coefficients(v, angle, _checks.degree_of(incident.shape[-1]))
             c = basis.coefficients(integrals.reshape(*integrals.shape[:-1], -1, basis.size))
             c = jnp.swapaxes(c, -1, -2)  # [*colour, n, p], as below
-        elif product is None:
-            c = times(loop_coefficients(v, angle, basis), _constant_radiance(light)[..., None])
         else:
-            c = _through(product, v, angle)
+            # close to a light its outline is nearly a hemisphere: which one, rounding must not decide
+            angle = loop_solid_angle(v, 2 * np.pi, _towards(light, relative))
+            uniform = lambda: times(loop_coefficients(v, angle, basis), _constant_radiance(light)[..., None])
+            c = uniform() if product is None else _through(product, v, angle)
         return finite_or_nan(jnp.moveaxis(times(c, sign), -1, 0), tile.values(), shared)
 
     size = 1 + 2048 // basis.size if isinstance(basis, HaarBasis) else _SMALL_TILE
@@ -245,14 +245,21 @@ def _project(
 
 
 def _facing(light: Light, relative: Loop) -> Float[Array, " p"]:
-    """-1 in front of a light, where its outline runs clockwise as seen from outside the sphere; 0 or 1 behind it.
-
-    Its plane is that of differences to a vertex, which keep their digits far from the origin.
-    """
-    edges = light.points - light.points[:1]
-    outwards = jnp.cross(edges, jnp.roll(edges, -1, 0)).sum(axis=0)
-    side = jnp.sign(outwards @ relative[:, 0])
+    """-1 in front of a light, where its outline runs clockwise as seen from outside the sphere; 0 or 1 behind it."""
+    side = jnp.sign(_normal(light) @ relative[:, 0])
     return side if light.two_sided else jnp.minimum(side, 0)
+
+
+def _normal(light: Light) -> Float[Array, "3"]:
+    """Normal of a light's plane, of any length: of differences to a vertex, exact far from the origin."""
+    edges = light.points - light.points[:1]
+    return jnp.cross(edges, jnp.roll(edges, -1, 0)).sum(axis=0)
+
+
+def _towards(light: Light, relative: Loop) -> Float[Array, "3 p"]:
+    """Directions from points straight to a light's plane: no vertex is more than a quarter turn away."""
+    normal = normalize(_normal(light))
+    return normal[:, None] * jnp.sign(normal @ relative[:, 0])[None]
 
 
 def _up(v: Loop) -> Float[Array, "3 p"]:

@@ -110,4 +110,10 @@ MUTANTS = [
         old="dx = distance[..., None] * (d_ray - ray[..., None] * slope)", new="dx = distance[..., None] * d_ray",
         test=MIRROR + "test_footprints_from_images_are_derivatives_of_the_mirror_direction[sphere-float64]",
     ),
+    Mutant(
+        "which hemisphere a close lamp is, by rounding", "shisd/shading/_polygon.py",
+        old="angle = loop_solid_angle(v, 2 * np.pi, _towards(light, relative))",
+        new="angle = loop_solid_angle(v, 2 * np.pi)",
+        test="tests/shading/test_polygon.py::test_projected_light_close_to_a_lamp",
+    ),
 ]  # fmt: skip

@@ -240,6 +240,19 @@ def test_projected_light_far_from_the_origin(rng):
         np.testing.assert_array_equal(at(np.asarray(offset)), here)
 
 
+@pytest.mark.parametrize("turn", [1, -1])
+def test_projected_light_close_to_a_lamp(turn):
+    """Nearly a hemisphere, from either side: the solid angle of a rectangle in closed form, by its four quarters."""
+    quad = np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]], np.float32)[::turn]
+    position = np.array([[0.1, 0.2, z] for z in (-0.01, -1e-5, -1e-7, 1e-7, 1e-6, 0.3)], np.float32)
+    light = models.PolygonLight(np.ascontiguousarray(quad), COLOURS, two_sided=True)
+    got = np.asarray(project(light, position))[:, :, 0] * np.sqrt(4 * np.pi)
+    x, y, z = position.astype(float).T
+    sides = [(a, b) for a in (1 - x, 1 + x) for b in (1 - y, 1 + y)]
+    truth = sum(np.arctan(a * b / (np.abs(z) * np.sqrt(a * a + b * b + z * z))) for a, b in sides)
+    np.testing.assert_allclose(got, truth[:, None] * COLOURS, rtol=2e-6)
+
+
 def test_several_lights(rng):
     """Those of one kind in a loop, others beside them: the sum of what each adds, with their gradients."""
     lobes, (position, normal, view) = slices("float32"), (a.astype(np.float32) for a in scene(rng))
