@@ -4,6 +4,7 @@ import math
 import os
 import struct
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +12,16 @@ import pytest
 
 from shisd import io, models
 from shisd.models import _measured
-from tests.models.materials import GOLD_PAINT, evaluate, hemisphere, pairs, slopes, spherical
+from tests.models.materials import GOLD_PAINT, evaluate, hemisphere, pairs, spherical
 
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
+
+
+@eqx.filter_jit
+def slopes(brdf, wi, wo):
+    """The sum over colours of `brdf.value_cosine` at rows of directions, and its derivatives in both."""
+    f = lambda wi, wo: jnp.sum(brdf.value_cosine(wi, wo))
+    return jax.vmap(jax.value_and_grad(f, argnums=(0, 1)))(wi, wo)
 
 
 def in_batches(function, brdf, wi, wo, dtype=np.float32, size=500):

@@ -195,8 +195,8 @@ MUTANTS = [
     Mutant(
         "harmonics imports filtering",
         "shisd/harmonics/_zh.py",
-        old="from shisd._typing import Array, Float\n",
-        new="from shisd import filtering\nfrom shisd._typing import Array, Float\n",
+        old="from shisd._typing import Array, ArrayLike, Float\n",
+        new="from shisd import filtering\nfrom shisd._typing import Array, ArrayLike, Float\n",
         test="tests/test_layering.py::test_what_a_module_imports[harmonics/_zh.py]",
     ),
 ]
