@@ -1,13 +1,23 @@
 """Settings of every test: shape checks on, both precisions by fixture, no silent promotion of types or ranks."""
 
+import os
+
 import jax
+import jaxlib
 import jaxtyping
 import numpy as np
 import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_disable_most_optimizations", True)  # most of the time is compiling
+
+# Most of the time is compiling: without most optimisations, and by XLA's older code for fusions, it is a quarter.
+# XLA reads its flags once, and ends the program at one that it does not know. Programs that tests start have none.
+jax.config.update("jax_disable_most_optimizations", True)
+if (0, 7) <= jaxlib.version.__version_info__[:2] <= (0, 10):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false")
+        jax.devices()
 
 _HOOK = jaxtyping.install_import_hook("shisd", "beartype.beartype")  # before the package is imported anywhere
 
