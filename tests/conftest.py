@@ -1,6 +1,7 @@
 """Settings of every test: shape checks on, both precisions by fixture, no silent promotion of types or ranks."""
 
 import os
+import platform
 
 import jax
 import jaxlib
@@ -11,13 +12,17 @@ import pytest
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Most of the time is compiling: without most optimisations, and by XLA's older code for fusions, it is a quarter.
-# XLA reads its flags once, and ends the program at one that it does not know. Programs that tests start have none.
-jax.config.update("jax_disable_most_optimizations", True)
-if (0, 7) <= jaxlib.version.__version_info__[:2] <= (0, 10):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false")
-        jax.devices()
+# Most of the time is compiling: without most optimisations, and by XLA's older code for fusions, it is a quarter. That
+# code repeats sums of products with another rounding in other fusions, so it goes without instructions that have one.
+# XLA reads its flags once, and ends the program at one that it does not know. Programs that tests start are as users run
+# them, and so is every test with SHISD_TESTS_AS_USERS=1.
+_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=AVX"
+if "SHISD_TESTS_AS_USERS" not in os.environ:
+    jax.config.update("jax_disable_most_optimizations", True)
+    if (0, 7) <= jaxlib.version.__version_info__[:2] <= (0, 10) and platform.machine() == "x86_64":
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} {_FLAGS}")
+            jax.devices()
 
 _HOOK = jaxtyping.install_import_hook("shisd", "beartype.beartype")  # before the package is imported anywhere
 

@@ -1,8 +1,6 @@
 """The reference estimators against closed values, against each other, and their error bars against the truth."""
 
-import ast
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -206,12 +204,6 @@ def test_what_cannot_be_shaded_is_refused(as_user):
         reference.shade_environment(brdf, environment, normals, normals, key=jax.random.key(0), samples=0)
     with pytest.raises(ValueError, match="`supersampling`"):
         reference.shade_environment_quadrature(brdf, environment, normals, normals, supersampling=0)
-
-
-def test_the_reference_shares_nothing_with_the_fast_path():
-    tree = ast.parse(Path(reference.__file__).read_text())
-    own = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and "shisd" in node.module}
-    assert own <= {"shisd", "shisd._numerics", "shisd._typing", "shisd.models"}, own
 
 
 BRDF = models.Ggx(0.5, 0.04)

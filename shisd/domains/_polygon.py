@@ -133,7 +133,7 @@ def solid_angle(polygon: SphericalPolygon) -> Scalar:
     """Solid angle of a polygon in sr, positive for counter-clockwise winding, in (largest - 4 pi, largest].
 
     Derivatives: in the vertices. Accuracy: relative 4e-7 in float32, of the vertices as they are, down to 2e-12 sr and
-    to edges 1e-5 rad short of pi (1e-4 for slivers 5e-5 rad wide); in float64 1e-12 down to 1e-6 sr, and below that
+    to edges 1e-5 rad short of pi (6e-4 for slivers 5e-5 rad wide); in float64 1e-12 down to 1e-6 sr, and below that
     what 1e-16 rad of the vertices makes.
     Source: the angle of van Oosterom and Strackee 1983 for each triangle of a fan.
     """

@@ -31,7 +31,8 @@ def test_solid_angle_of_hard_cases(name, dtype):
         return
     expected = truth.triangle_rule(vertices, 60)[1].sum() if name in POLYGONS else truth.solid_angle(vertices)
     known = 1e-15 / abs(expected) ** 0.5 if name in TINY else 4e-9 if name in HALF_TURNS else 1e-11
-    relative = {"float64": known, "float32": 1e-4 if name == "sliver" else 4e-7}[dtype.name]
+    # of the sliver 6e-4 where products are fused with sums, a tenth of it where not
+    relative = {"float64": known, "float32": 2e-3 if name == "sliver" else 4e-7}[dtype.name]
     np.testing.assert_allclose(float(area(vertices.astype(dtype))), float(expected), rtol=float(relative))
 
 
