@@ -14,8 +14,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Most of the time is compiling: without most optimisations, and by XLA's older code for fusions, it is a quarter. That
 # code repeats sums of products with another rounding in other fusions, so it goes without instructions that have one.
-# XLA reads its flags once, and ends the program at one that it does not know. Programs that tests start are as users run
-# them, and so is every test with SHISD_TESTS_AS_USERS=1.
+# XLA reads its flags once, and ends the program at one that it does not know. Programs that tests start are as users
+# run them, and so is every test with SHISD_TESTS_AS_USERS=1.
 _FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=AVX"
 if "SHISD_TESTS_AS_USERS" not in os.environ:
     jax.config.update("jax_disable_most_optimizations", True)

@@ -236,8 +236,10 @@ def _project(
         else:
             # close to a light its outline is nearly a hemisphere: which one, rounding must not decide
             angle = loop_solid_angle(v, 2 * np.pi, _towards(light, relative))
-            uniform = lambda: times(loop_coefficients(v, angle, basis), _constant_radiance(light)[..., None])
-            c = uniform() if product is None else _through(product, v, angle)
+            if product is None:
+                c = times(loop_coefficients(v, angle, basis), _constant_radiance(light)[..., None])
+            else:
+                c = _through(product, v, angle)
         return finite_or_nan(jnp.moveaxis(times(c, sign), -1, 0), tile.values(), shared)
 
     size = 1 + 2048 // basis.size if isinstance(basis, HaarBasis) else _SMALL_TILE
