@@ -205,7 +205,12 @@ CASES = [
         lambda: (basis(), normal(3, 5), W),
         (2,),
     ),
-    Case("decomposition.RotatedZonalBasis.condition_numbers", lambda b: b.condition_numbers(), lambda: (basis(),)),
+    Case(
+        "decomposition.RotatedZonalBasis.condition_numbers",
+        lambda b: b.condition_numbers(),
+        lambda: (basis(),),
+        idle=("*",),  # of axes that are optimal several eigenvalues are one; elsewhere in test_basis
+    ),
     Case(
         "decomposition.RotatedZonalBasis.unchecked_coefficients",
         lambda b, w: b.unchecked_coefficients(w),
@@ -217,7 +222,7 @@ CASES = [
     Case("decomposition.IsotropicBasis.weights", lambda b, c: b.weights(c), lambda: (kernels(), normal(N, 9)), (1,)),
     Case(
         "decomposition.IsotropicBasis.solve",
-        lambda b, c: b.solve(c, ridge=0.1),
+        lambda b, c: [(x := b.solve(c, ridge=0.1)).weights, x.residual],  # the condition is one for all
         lambda: (kernels(), normal(N, 9)),
         (1,),
     ),
@@ -285,7 +290,7 @@ CASES = [
     ),
     Case(
         "decomposition.sparse_weights",
-        lambda b, c: decomposition.sparse_weights(b, c, 3)[0],
+        lambda b, c: b.coefficients(decomposition.sparse_weights(b, c, 3)[0]),  # of band 0 all axes are alike
         lambda: (basis(), normal(N, 9)),
         (1,),
         heavy=True,
@@ -417,13 +422,13 @@ CASES = [
     Case("shading.band_energies", shading.band_energies, lambda: (lobes(),), idle=("quadrature_error",)),
     Case(
         "shading.tabulate_brdf",
-        lambda f, b: shading.tabulate_brdf(f, b, views=4, quadrature=16, throw=False),
+        lambda f, b: shading.tabulate_brdf(f, b, views=4, quadrature=48, throw=False),
         lambda: (BRDFS["Phong"](), basis()),
         heavy=True,
     ),
     Case(
         "shading.project_brdf",
-        lambda f: shading.project_brdf(f, 2, quadrature=16, throw=False),
+        lambda f: shading.project_brdf(f, 2, quadrature=48, throw=False),
         lambda: (BRDFS["Phong"](),),
         heavy=True,
     ),
@@ -501,7 +506,7 @@ CASES = [
         lambda l, e, like: shading.prefilter(l, e, like=like),
         lambda: (lobes(), normal(3, 9), prefiltered()),
         heavy=True,
-        idle=("quadrature_error", "profiles", "maps", "reduce", "expand", "error"),
+        idle=("*",),  # the channels of `like` are those of values; elsewhere in test_prefiltered
     ),
     Case(
         "shading.shade_prefiltered",
@@ -539,6 +544,7 @@ CASES = [
         lambda f, e, n, o: reference.shade_environment(f, e, n, o, key=jax.random.key(0), samples=16),
         lambda: (BRDFS["Phong"](), environment(), NORMALS, VIEWS),
         heavy=True,
+        idle=("*",),  # no derivative passes through where samples lie
     ),
     Case(
         "reference.shade_environment_quadrature",
@@ -712,7 +718,7 @@ def test_forms_of_arrays_change_nothing(case, as_user):
     forms = {
         "list": lambda a: a.tolist(),
         "strides": lambda a: np.repeat(a, 2, axis=-1)[..., ::2] if a.ndim else a,
-        "columns first": np.asfortranarray,
+        "columns first": lambda a: np.asarray(a, order="F"),
         "big-endian": lambda a: a.astype(a.dtype.newbyteorder(">")),
     }
     for name, form in forms.items():
