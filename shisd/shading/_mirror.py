@@ -78,7 +78,7 @@ def prefilter_mirror(texels: ArrayLike, *, levels: int = 13, degree: int | None 
     """Filter a map with Gaussians of a few widths, once for any number of pixels: see `shade_prefiltered_mirror`.
 
     Arguments: `texels` [H, 2H] or [H, 2H, colour] as in `harmonics.project_map`; static `levels` >= 2, the map itself
-    and widths from 3 / degree to 1 rad in equal ratios; static `degree` at which the map is filtered, by default H - 1,
+    and widths from 3 / degree, at most 0.5, to 1 rad in equal ratios; static `degree` at which the map is filtered, by default H - 1,
     at most 255.
     Derivatives: linear in the texels. Cost: one projection, and a synthesis for each level.
     """
@@ -86,7 +86,7 @@ def prefilter_mirror(texels: ArrayLike, *, levels: int = 13, degree: int | None 
     if texels.ndim not in (2, 3) or texels.shape[1] != 2 * texels.shape[0] or 0 in texels.shape:
         raise ValueError(f"`texels` must have shape [H, 2H] or [H, 2H, colour]; got {list(texels.shape)}.")
     degree = min(len(texels) - 1, 255) if degree is None else _checks.degree(degree)
-    variances = np.concatenate([[0], np.geomspace(min(3 / max(degree, 1), 1), 1, levels - 1) ** 2])
+    variances = np.concatenate([[0], np.geomspace(min(3 / max(degree, 1), 0.5), 1, levels - 1) ** 2])
     e = project_map(texels, degree).reshape(-1, 1, (degree + 1) ** 2)
     kept = jnp.asarray(np.exp(-np.outer(variances[1:], _half_eigenvalues(degree)))[:, _tables.bands(degree)], e.dtype)
     filtered = synthesize_map(jnp.swapaxes(e * kept[None], 0, 1), len(texels))

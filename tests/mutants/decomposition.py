@@ -90,8 +90,8 @@ MUTANTS = [
     Mutant(
         "filtered lobes with the error of others",
         "shisd/shading/_prefiltered.py",
-        old="    tables = _filter(",
-        new='    error = {"error": like.error + 0.005}\n    tables = error | _filter(',
+        old="replace(like, **tables, colours",
+        new='replace(like, **tables | {"error": like.error}, colours',
         test="tests/shading/test_prefiltered.py::test_error_is_as_predicted[glossy-float32]",
     ),
     Mutant(
