@@ -78,8 +78,8 @@ def prefilter_mirror(texels: ArrayLike, *, levels: int = 13, degree: int | None 
     """Filter a map with Gaussians of a few widths, once for any number of pixels: see `shade_prefiltered_mirror`.
 
     Arguments: `texels` [H, 2H] or [H, 2H, colour] as in `harmonics.project_map`; static `levels` >= 2, the map itself
-    and widths from 3 / degree, at most 0.5, to 1 rad in equal ratios; static `degree` at which the map is filtered, by default H - 1,
-    at most 255.
+    and widths from 3 / degree, at most 0.5, to 1 rad in equal ratios; static `degree` at which the map is filtered, by
+    default H - 1, at most 255.
     Derivatives: linear in the texels. Cost: one projection, and a synthesis for each level.
     """
     texels, levels = _checks.real_array("texels", texels), _checks.integer("levels", levels, minimum=2)
