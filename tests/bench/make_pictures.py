@@ -84,7 +84,8 @@ def scene(mi, name: str, size: int) -> dict:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of texels that are no radiance
             room = models.Environment.load(DATA / "studio.exr")
-        whole["sky"] = environment(mi, room.radiance, 2048)  # the map's texels, bilinear, four times as fine
+        seen = lambda w: room.radiance(w, texels="samples")
+        whole["sky"] = environment(mi, seen, 2048)  # the map's texels, bilinear, four times as fine
         return whole | {"ball": {"type": "sphere", "bsdf": material(mi, **MATERIAL)}}
     coefficients = sky_light()[:, None, None].astype(np.float32)
     radiance = lambda w: np.moveaxis(np.asarray(harmonics.evaluate(coefficients, w)), 0, -1)

@@ -179,7 +179,7 @@ def room() -> models.Environment:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of texels that are no radiance
         texels = models.Environment.load(DATA / "interior.hdr")
-    return models.Environment.from_function(texels.radiance, MAP_HEIGHT)
+    return models.Environment.from_function(lambda w: texels.radiance(w, texels="samples"), MAP_HEIGHT)
 
 
 def ours(name: str, degree: int, rays) -> Method:
@@ -230,7 +230,8 @@ def scene(mi, name: str) -> dict:
     whole = {"type": "scene", "sensor": sensor, "integrator": {"type": "direct"}}
     bsdf = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": ALPHA}
     if name == "sphere":
-        sky = make_pictures.environment(mi, room().radiance, MAP_HEIGHT)
+        seen = functools.partial(room().radiance, texels="samples")
+        sky = make_pictures.environment(mi, seen, MAP_HEIGHT)
         return whole | {"sky": sky, "ball": {"type": "sphere", "bsdf": bsdf}}
     to_world = np.eye(4)
     to_world[:3, 0], to_world[:3, 1] = (LAMP[1] - LAMP[0]) / 2, (LAMP[3] - LAMP[0]) / 2
