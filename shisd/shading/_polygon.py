@@ -34,6 +34,7 @@ from shisd.models._light import product_matrices
 from shisd.shading._incidence import incidence_integrals
 from shisd.shading._lobes import Lobes, check_lobes, lookup_factors, lookup_table, slice_values
 from shisd.shading._surface import (
+    as_type,
     finite_mark,
     finite_or_nan,
     in_tiles,
@@ -124,7 +125,7 @@ def project_light(
         basis = _checks.integer("basis", basis)
     p = _checks.vectors("positions", positions)
     dtype = jnp.promote_types(p.dtype, light.points.dtype)
-    light = jax.tree.map(lambda x: x.astype(dtype), light)
+    light = as_type(light, dtype)
     return by_device(shade_points, {"positions": p.astype(dtype)} | masks(mask), _project, light, basis)
 
 
@@ -145,7 +146,7 @@ def _shade_lights(
     vectors = {"positions": positions, "normals": normals, "views": views}
     dtypes = [x.points.dtype for x in lights]
     lobes, points, colour = surface("lobes", lobes, tangents, colours, dtypes, mask, **vectors)
-    lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
+    lights = as_type(lights, lobes.weights.dtype)
     return by_device(shade_points, points, _shade, lobes, lights, colour)
 
 

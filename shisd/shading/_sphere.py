@@ -10,7 +10,6 @@ notation: a = direction to the center, in the local frame; z_l = integral of P_l
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from shisd._numerics import times
@@ -20,7 +19,7 @@ from shisd.domains._region import cap_coefficients
 from shisd.models import SphereLight
 from shisd.models._light import versine
 from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
-from shisd.shading._surface import local_lights, shade_points, shade_tiles, stacked, sum_lights, surface
+from shisd.shading._surface import as_type, local_lights, shade_points, shade_tiles, stacked, sum_lights, surface
 
 
 def shade_sphere(
@@ -51,7 +50,7 @@ def shade_sphere(
     vectors = {"positions": positions, "normals": normals, "views": views}
     dtypes = [x.center.dtype for x in lights]
     lobes, points, colour = surface("lobes", lobes, tangents, colours, dtypes, mask, **vectors)
-    lights = jax.tree.map(lambda x: x.astype(lobes.weights.dtype), lights)
+    lights = as_type(lights, lobes.weights.dtype)
     return by_device(shade_points, points, _shade, lobes, lights, colour)
 
 
