@@ -146,11 +146,12 @@ def _as_radiance(texels: np.ndarray, path: str, bad_texels: str) -> np.ndarray:
     finite = np.isfinite(texels)
     largest = max(float(np.max(texels, where=finite, initial=0)), 65504)
     kinds = {"NaN": (np.isnan(texels), 0), "infinite": (np.isposinf(texels), largest), "negative": (texels < 0, 0)}
-    total, found, done = texels.shape[0] * texels.shape[1], [], []
+    total, found, done, clean = texels.shape[0] * texels.shape[1], [], [], texels
     for name, (bad, value) in kinds.items():
         if count := int(np.sum(np.any(bad.reshape(total, -1), axis=1))):
             found.append(f"{count} {name} texel{'s' * (count > 1)}")
             done.append(f"{found[-1]} set to {value:.6g}")
+            clean = np.where(bad, np.float32(value), clean)
     if not found:
         return texels
     if bad_texels == "refuse":
@@ -158,7 +159,7 @@ def _as_radiance(texels: np.ndarray, path: str, bad_texels: str) -> np.ndarray:
     if not finite.any():
         raise ValueError(f"{path}: {', '.join(found)} of {total}: no finite value is left.")
     warnings.warn(f"{path}: {', '.join(done)}, of {total}.", UserWarning, stacklevel=3)
-    return np.clip(np.nan_to_num(texels, nan=0.0, posinf=largest), 0, None)
+    return clean
 
 
 def _directions(height: int) -> np.ndarray:
