@@ -10,7 +10,7 @@ from jax.scipy.linalg import solve_triangular
 
 from shisd import _checks
 from shisd._typing import Array, ArrayLike, Float
-from shisd.decomposition._basis import RotatedZonalBasis, by_band
+from shisd.decomposition._basis import RotatedZonalBasis, by_band, minimum_norm, padding
 
 
 def sparse_weights(
@@ -23,7 +23,7 @@ def sparse_weights(
     Arguments: `basis`; `coefficients` [..., (L+1)^2], which share the axes: use jax.vmap or jax.lax.map to choose for
     each; static `count`, 1 to K. Returns weights [..., L+1, K], zero on the other axes, and the axes' indices [count]
     in the order of choice.
-    Derivatives: in the coefficients, the choice held fixed.
+    Derivatives: in coefficients and axes, the choice held fixed.
     Accuracy: the least squares fit on these axes, with a ridge of the rounding. Cost: count x K x L^2.
     """
     c, given = _checks.coefficients("coefficients", coefficients)
@@ -54,13 +54,19 @@ def _choose(basis: RotatedZonalBasis, c: Float[Array, "*batch n"], count: int) -
         return (project(left), project(rest)), k
 
     _, chosen = jax.lax.scan(choose, jax.lax.stop_gradient((m, target)), length=count)
-    ridge = tolerance * jnp.eye(count, dtype=c.dtype)
+    # By least norm, which has derivatives in the axes, where axes are as many as a band has coefficients.
+    columns = m[:, :, chosen]
+    wide = min((count + 1) // 2, basis.degree + 1)
+    mask = padding(basis.degree)[1][:wide]
+    few = minimum_norm(columns[:wide], target[:wide], mask, [""] * wide, 4 * tolerance**2)  # which resolves any axes
 
     def solve(band):
         columns, right = band
-        q, r = jnp.linalg.qr(jnp.concatenate([columns, ridge]))
+        q, r = jnp.linalg.qr(jnp.concatenate([columns, tolerance * jnp.eye(count, dtype=c.dtype)]))
         return solve_triangular(r, jnp.matmul(q[: len(columns)].T, right, precision="highest"))
 
-    few = jax.lax.map(solve, (m[:, :, chosen], target))  # one band after another: see `_basis`
+    if wide <= basis.degree:
+        rest = jax.lax.map(solve, (columns[wide:], target[wide:]))  # one band after another: see `_basis`
+        few = jnp.concatenate([few, rest])
     weights = jnp.zeros((basis.degree + 1, basis.size, target.shape[-1]), c.dtype).at[:, chosen].set(few)
     return jnp.moveaxis(weights, -1, 0).reshape(*c.shape[:-1], basis.degree + 1, basis.size), chosen

@@ -75,31 +75,25 @@ def _by_degree(weights: Float[Array, "k l q"]) -> Float[Array, "bands k q"]:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def _fold(weights: Array, axes: Array, v: Loop, degree: int, spare: int) -> Float[Array, " p"]:
     arcs = _arcs(v)
-    edges, more = jnp.split(arcs.edges, [v.shape[1] - spare], axis=1)
-    value = _fold_edges(weights, axes, arcs.c, arcs.total, edges, degree)
-    if spare == 0:
-        return value
-    used = jnp.any(_unpack(_Edges, more).over_angle != 0)
-    rest = lambda: value + _fold_edges(weights, axes, arcs.c, jnp.zeros_like(arcs.total), more, degree)
-    return jax.lax.cond(used, rest, lambda: value)
+    return _fold_edges(weights, axes, arcs.c, arcs.total, arcs.edges, degree, spare)
 
 
-@functools.partial(jax.jit, static_argnames="degree")  # so that it is traced once
-def _fold_edges(weights: Array, axes: Array, center: Array, total: Array, edges: Array, degree: int) -> Array:
+@functools.partial(jax.jit, static_argnames=("degree", "spare"))  # so that it is traced once
+def _fold_edges(
+    weights: Array, axes: Array, center: Array, total: Array, edges: Array, degree: int, spare: int
+) -> Array:
     """Axes in turn; for each, edges and degrees are straight code over plain vectors of points.
 
     That becomes one kernel in vector registers. Arrays over axes and points, or more than a few operands, would make it
-    scalar code, since LLVM could not tell that they do not overlap.
+    scalar code, since LLVM could not tell that they do not overlap. Edges beyond those of one kernel, and spare ones,
+    are further turns of it, left out where no edge has a length.
     """
-    groups = math.ceil(edges.shape[1] / _edges_at_once(degree))
-    none = jnp.zeros((edges.shape[0], -edges.shape[1] % groups, edges.shape[2]), edges.dtype)
-    edges = jnp.concatenate([edges, none], axis=1)  # edges of no length fill up the last group
-    share, factors = total / groups, _factors(2, degree, edges.dtype)
+    factors = _factors(2, degree, edges.dtype)
 
-    def group(value: Array, edges: Float[Array, "rows e p"]) -> tuple[Array, None]:
+    def group(value: Array, edges: Float[Array, "rows p"], share: Array) -> Array:
         def axis(value: Array, d: Array, w: Array) -> Array:
             c = _reference(center, d)
-            terms = _zonal_terms([_unpack(_Edges, edges[:, e]) for e in range(edges.shape[1])], d, c)
+            terms = _zonal_terms([_unpack(_Edges, edge) for edge in jnp.split(edges, size)], d, c)
             point, states = c.start(), [t.start() for t in terms]
             sums, sum_c = [jnp.zeros_like(c.gap) for _ in terms], w[1]
             for l in range(2, degree + 1):
@@ -111,13 +105,25 @@ def _fold_edges(weights: Array, axes: Array, center: Array, total: Array, edges:
             change = dot(share, d) * sum_c + sum(t.along * x for t, x in zip(terms, sums, strict=True))
             return value + change
 
-        return _for_axes(axis, value, axes, weights), None
+        return _for_axes(axis, value, axes, weights)
 
     value = jnp.zeros_like(total[0])
+    usual = edges.shape[1] - spare
+    size = math.ceil(usual / math.ceil(usual / _edges_at_once(degree)))
+    groups = math.ceil(usual / size) + math.ceil(spare / size)
+    none = jnp.zeros((edges.shape[0], groups * size - edges.shape[1], edges.shape[2]), edges.dtype)
+    edges = jnp.concatenate([edges, none], axis=1)
+    parts = jnp.moveaxis(edges, 1, 0).reshape(groups, -1, edges.shape[2])  # rows of one array: others are copied
     if groups == 1:
-        return group(value, edges)[0]
-    parts = edges.reshape(edges.shape[0], groups, -1, edges.shape[2])
-    return jax.lax.scan(group, value, jnp.moveaxis(parts, 1, 0))[0]
+        return group(value, parts[0], total)
+
+    def group_if_any(value: Array, part: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        used, edges, share = part
+        return jax.lax.cond(used, group, lambda value, *_: value, value, edges, share), None
+
+    used = jnp.any((_unpack(_Edges, edges).over_angle != 0).reshape(groups, -1), axis=1)
+    shares = jnp.concatenate([total[None], jnp.zeros((groups - 1, *total.shape), total.dtype)])
+    return jax.lax.scan(group_if_any, value, (used, parts, shares))[0]
 
 
 def _edges_at_once(degree: int) -> int:

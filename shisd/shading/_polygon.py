@@ -78,7 +78,7 @@ def shade_polygon(
     Cost: moments at L+1 axes, 2L+1 for anisotropic materials, for every pixel, light and colour of the material; half
     as many edges again where the horizon cuts a light in any of 2048 pixels that follow each other, nothing where it is
     dark in all; of lights with a profile, that of `shade_portal`. Lights of equal shapes (corners, colours, profile)
-    are one piece of compiled code, whatever their number. Memory: one tile of 2048 pixels, of each light for gradients.
+    are one piece of compiled code, whatever their number. Memory: one tile of 2048 pixels, also for gradients.
     """
     return _shade_lights(lobes, light, PolygonLight, "light", positions, normals, views, tangents, mask)
 
@@ -155,7 +155,8 @@ def _shade(
     points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[Light, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     table = lookup_table(lobes)
-    stacks = [(stack, _products(stack, lobes.degree)) for stack in stacked(lights)]
+    kinds = stacked(lights)
+    stacks = [(stack, _products(stack, lobes.degree)) for stack in kinds]
 
     def radiance(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
@@ -177,7 +178,7 @@ def _shade(
         return sum_lights(of_light, stacks, zero)
 
     size = _TILE if all(product is None for _, product in stacks) else _SMALL_TILE
-    return shade_tiles(lobes, points, colour, size, radiance, lights)
+    return shade_tiles(lobes, points, colour, size, radiance, kinds)
 
 
 def _uniform(lobes: Lobes, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:

@@ -76,4 +76,4 @@ def _shade(
 
         return sum_lights(of_light, stacks, zero)
 
-    return shade_tiles(lobes, points, colour, 1024, radiance, lights)
+    return shade_tiles(lobes, points, colour, 1024, radiance, stacks)

@@ -279,6 +279,21 @@ def test_sparse_weights_are_linear_in_coefficients_once_chosen(x64, rng):
     check_grads(lambda c: decomposition.sparse_weights(basis, c, 2)[0], (c,), order=1, modes=["fwd", "rev"])
 
 
+@pytest.mark.parametrize("count", [3, 5, 7, 9])  # less than, as many as, and more than a band has coefficients
+def test_sparse_weights_have_derivatives_in_axes(x64, rng, count):
+    z, c, turn = decomposition.optimized_directions(4), rng.normal(size=25), rng.normal(size=(9, 3))
+    weigh = lambda z: decomposition.sparse_weights(decomposition.RotatedZonalBasis(z, 4), c, count)[0]
+    slope = jax.jvp(weigh, (jnp.asarray(z, float),), (jnp.asarray(turn),))[1]
+    expected = (weigh(z + 1e-6 * turn) - weigh(z - 1e-6 * turn)) / 2e-6
+    np.testing.assert_allclose(slope, expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+def test_sparse_weights_of_equal_and_opposite_axes_are_finite(rng):
+    z = decomposition.optimized_directions(1)
+    basis = decomposition.RotatedZonalBasis(np.concatenate([z, -z, z]), 3)
+    assert np.isfinite(decomposition.sparse_weights(basis, rng.normal(size=16).astype(np.float32), basis.size)[0]).all()
+
+
 def test_wrong_arguments_of_sparse_weights(as_user):
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(2), 2)
     with pytest.raises(ValueError, match="degree 2; got degree 1"):
