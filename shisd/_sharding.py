@@ -38,6 +38,12 @@ def by_device(function: Callable[..., Any], batch: dict[str, Array], *shared: An
     return _by_device(function, batch, shared, tuple(axes), mesh)
 
 
+def whole(a: Array) -> Array:
+    """A batch that is worked on together, whole on every device."""
+    sharding = jax.typeof(a).sharding
+    return a if all(axis is None for axis in sharding.spec) else jax.sharding.reshard(a, NamedSharding(sharding.mesh, PartitionSpec()))
+
+
 @eqx.filter_jit
 def _by_device(function: Callable[..., Any], batch: dict[str, Array], shared: Any, axes: tuple, mesh: Any) -> Any:
     def spec(a: Array) -> PartitionSpec:

@@ -68,7 +68,6 @@ class Case:
     `batch` numbers those that have a leading axis of N rows; `native` says whether the function takes that axis itself
     or by `jax.vmap` alone. `heavy` cases compile for long: their numbers are compared among the slow tests. `idle`
     names the fields of the objects that rightly do not act on the result, "*" a function without derivatives.
-    `explicit` says whether batches may be sharded over explicit mesh axes, not automatic ones alone.
     """
 
     name: str
@@ -78,7 +77,6 @@ class Case:
     native: bool = True
     heavy: bool = False
     idle: tuple[str, ...] = ()
-    explicit: bool = True
 
 
 RNG = np.random.default_rng(7)
@@ -194,7 +192,9 @@ CASES = [
     ),
     Case(
         "decomposition.RotatedZonalBasis.weights",
-        lambda b, c: b.weights(c), lambda: (basis(), normal(N, 9)), (1,), explicit=False,
+        lambda b, c: b.weights(c),
+        lambda: (basis(), normal(N, 9)),
+        (1,),
     ),
     Case(
         "decomposition.RotatedZonalBasis.coefficients",
@@ -224,14 +224,15 @@ CASES = [
     Case("decomposition.IsotropicBasis.matrix", lambda b: b.matrix(), lambda: (kernels(),)),
     Case(
         "decomposition.IsotropicBasis.weights",
-        lambda b, c: b.weights(c), lambda: (kernels(), normal(N, 9)), (1,), explicit=False,
+        lambda b, c: b.weights(c),
+        lambda: (kernels(), normal(N, 9)),
+        (1,),
     ),
     Case(
         "decomposition.IsotropicBasis.solve",
         lambda b, c: [(x := b.solve(c, ridge=0.1)).weights, x.residual],  # the condition is one for all
         lambda: (kernels(), normal(N, 9)),
         (1,),
-        explicit=False,
     ),
     Case(
         "decomposition.IsotropicBasis.coefficients",
@@ -251,7 +252,6 @@ CASES = [
         lambda b, c, s, r: b.filter(c, s, r),
         lambda: (kernels(), normal(3, 5), normal(3, 9), TURN),
         (3,),
-        explicit=False,
     ),
     Case(
         "decomposition.IsotropicBasis.prefilter",
@@ -265,7 +265,6 @@ CASES = [
         lambda: (kernels(), normal(3, 5), normal(3, 6, 12, 3), TURN),
         (3,),
         idle=("sharpness",),
-        explicit=False,
     ),
     Case("decomposition.GaussianLobes.coefficients", lambda l: l.coefficients(2), lambda: (gaussians(),)),
     Case("decomposition.ZonalLobes.coefficients", lambda l: l.coefficients(2), lambda: (rotated(),)),
@@ -303,7 +302,6 @@ CASES = [
         lambda: (basis(), normal(N, 9)),
         (1,),
         heavy=True,
-        explicit=False,
     ),
     Case(
         "domains.zonal_moments",
@@ -346,7 +344,9 @@ CASES = [
     Case("domains.HaarBasis.values", lambda x: domains.HaarBasis(1).values(x), lambda: (normal(N, 32),), (0,)),
     Case(
         "domains.HaarBasis.evaluate",
-        lambda c, w: domains.HaarBasis(1).evaluate(c, w), lambda: (normal(32), W), (1,), explicit=False,
+        lambda c, w: domains.HaarBasis(1).evaluate(c, w),
+        lambda: (normal(32), W),
+        (1,),
     ),
     Case(
         "domains.HaarBasis.project",
@@ -386,7 +386,6 @@ CASES = [
         lambda: (visibility(), np.zeros(N, np.int32), np.abs(W)),
         (1, 2),
         idle=("noise",),
-        explicit=False,
     ),
     Case("models.cap_visibility", lambda a, t: models.cap_visibility(a, t, 2), lambda: (W, np.abs(W[:, 0])), (0, 1)),
     Case("shading.Lobes.coefficients", lambda l: l.coefficients(), lambda: (lobes(),), idle=("quadrature_error",)),
@@ -780,8 +779,7 @@ def test_every_field_acts_and_has_a_gradient(case, x64):
 def test_sharded_batches_are_as_others(case):
     if jax.device_count() < 2:
         pytest.skip("one device; the next test starts this one with two")
-    kind = jax.sharding.AxisType.Explicit if case.explicit else jax.sharding.AxisType.Auto
-    mesh = jax.make_mesh((2,), ("rows",), axis_types=(kind,))
+    mesh = jax.make_mesh((2,), ("rows",), axis_types=(jax.sharding.AxisType.Explicit,))
     place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("rows"))
     inputs = arguments(case)
     split = [jax.device_put(x, place) if i in case.batch else x for i, x in enumerate(inputs)]

@@ -22,6 +22,7 @@ from shisd import _checks
 from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import normalize, same_dtype
+from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition._directions import check_count
 from shisd.harmonics import sh_basis
@@ -67,7 +68,7 @@ class RotatedZonalBasis(Module):
         Coefficients come back within 10 eps sqrt(K) times the norm of a band's weights.
         Cost: L+1 QR decompositions of K x (2L+1); batches of coefficients share them.
         """
-        return _weights(self, check_coefficients(coefficients, self.degree))
+        return by_device(_weights, {"coefficients": check_coefficients(coefficients, self.degree)}, self)
 
     @method
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
@@ -131,8 +132,9 @@ class RotatedZonalBasis(Module):
 
 
 @eqx.filter_jit
-def _weights(basis: RotatedZonalBasis, c: Float[Array, "*batch n"]) -> Float[Array, "*batch l k"]:
-    return used_only(weights_by_band(basis._matrices(), c, basis.degree), basis.nested)
+def _weights(batch: dict[str, Array], basis: RotatedZonalBasis) -> Float[Array, "*batch l k"]:
+    weights = weights_by_band(basis._matrices(), batch["coefficients"], basis.degree)
+    return used_only(weights, basis.nested)
 
 
 @eqx.filter_jit

@@ -23,6 +23,7 @@ from shisd import _checks
 from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import normalize, safe_sqrt, same_dtype
+from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import _basis
 from shisd.decomposition._directions import check_count
@@ -110,13 +111,14 @@ class IsotropicBasis(Module):
         Cost: one QR of [(L+1) K, (L+1)^2]; for `LegendreKernel` band by band.
         """
         c = _basis.check_coefficients(coefficients, self.degree)
-        return _weights(self, c, _checks.number("ridge", ridge))
+        return by_device(_weights, {"coefficients": c}, self, _checks.number("ridge", ridge))
 
     @method
     def solve(self, coefficients: ArrayLike, *, ridge: float = 0.0) -> Decomposition:
         """`weights`, with their residual and the condition number of M."""
         c = _basis.check_coefficients(coefficients, self.degree)
-        return _decompose(self, c, _checks.number("ridge", ridge))
+        weights, residual = by_device(_with_residual, {"coefficients": c}, self, _checks.number("ridge", ridge))
+        return Decomposition(weights, residual, _condition_number(self))
 
     @method
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
@@ -149,7 +151,8 @@ class IsotropicBasis(Module):
         Cost: for every rotation the harmonics at all axes; memory does not grow with the number of rotations.
         """
         signal = _basis.check_coefficients(signal, self.degree)
-        return _filter(self, *self._rotated(weights, rotations, signal))
+        batch, signal = self._rotated(weights, rotations, signal)
+        return by_device(_filter, batch, self, signal)
 
     @method
     def prefilter(self, signal: ArrayLike, height: int) -> Float[Array, "levels h w *colour"]:
@@ -168,7 +171,8 @@ class IsotropicBasis(Module):
             raise ValueError(
                 f"`maps` must come from `prefilter`, [{self.degree + 1}, H, 2 H, *colour]; got {list(texels.shape)}."
             )
-        return _filter_maps(self, *self._rotated(weights, rotations, texels))
+        batch, texels = self._rotated(weights, rotations, texels)
+        return by_device(_filter_maps, batch, self, texels)
 
     def _blocks(self, m: Float[Array, "n l k"]) -> Float[Array, "l rows k"]:
         """The blocks M_l of a kernel whose level l is band l, stacked and padded."""
@@ -197,21 +201,21 @@ class IsotropicBasis(Module):
         levels = self.degree + 1
         return convolve(signal, self.zonal().reshape(levels, *(1,) * (signal.ndim - 1), levels))
 
-    def _rotated(self, weights: ArrayLike, rotations: ArrayLike, signal: Array) -> tuple[Array, Array, Array]:
-        """Checked weights and rotations of one batch, and the signal, in one dtype."""
+    def _rotated(self, weights: ArrayLike, rotations: ArrayLike, signal: Array) -> tuple[dict[str, Array], Array]:
+        """Checked weights and rotations as rows of one batch, and the signal, in one dtype."""
         weights = _basis.check_weights(weights, self.degree, self.size, self.nested)
         r = _checks.real_array("rotations", rotations)
         if r.shape[-2:] != (3, 3):
             raise ValueError(f"`rotations` must have shape [..., 3, 3]; got {list(r.shape)}.")
         try:
-            batch = np.broadcast_shapes(weights.shape[:-2], r.shape[:-2])
+            np.broadcast_shapes(weights.shape[:-2], r.shape[:-2])
         except ValueError as error:
             raise ValueError(
                 f"leading axes of `weights` {list(weights.shape)} and `rotations` {list(r.shape)} do not broadcast."
             ) from error
         dtype = jnp.result_type(weights, r, self.directions, signal)
-        weights, r = (jnp.broadcast_to(a.astype(dtype), (*batch, *a.shape[-2:])) for a in (weights, r))
-        return weights, r, signal.astype(dtype)
+        rows = {"weights": weights, "rotations": r}
+        return {name: a.astype(dtype).reshape(*a.shape[:-2], -1) for name, a in rows.items()}, signal.astype(dtype)
 
 
 _SINGULAR = (
@@ -248,20 +252,20 @@ def _matrix(basis: IsotropicBasis) -> Float[Array, "n l k"]:
 
 
 @eqx.filter_jit
-def _weights(basis: IsotropicBasis, c: Float[Array, "*batch n"], ridge: float) -> Float[Array, "*batch l k"]:
-    return basis._solve(_matrix(basis), c, ridge)
+def _weights(batch: dict[str, Array], basis: IsotropicBasis, ridge: float) -> Float[Array, "*batch l k"]:
+    return basis._solve(_matrix(basis), batch["coefficients"], ridge)
 
 
 @eqx.filter_jit
-def _decompose(basis: IsotropicBasis, c: Float[Array, "*batch n"], ridge: float) -> Decomposition:
-    m = _matrix(basis)
+def _with_residual(batch: dict[str, Array], basis: IsotropicBasis, ridge: float) -> tuple[Array, Array]:
+    m, c = _matrix(basis), batch["coefficients"]
     weights = basis._solve(m, c, ridge)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(c), axis=-1, keepdims=True))
     scale = jnp.where(largest > 0, largest, 1)  # squares of large and of small numbers leave the range
     norm = lambda a: safe_sqrt(jnp.sum((a / scale) ** 2, axis=-1))
     size = norm(c)
     residual = norm(_apply(m, weights) - c) / jnp.where(size > 0, size, 1)
-    return Decomposition(weights, residual, basis._condition(m))
+    return weights, residual
 
 
 @eqx.filter_jit
@@ -275,14 +279,14 @@ def _condition_number(basis: IsotropicBasis) -> Scalar:
 
 
 @eqx.filter_jit
-def _filter(basis: IsotropicBasis, weights: Array, rotations: Array, signal: Array) -> Float[Array, "*batch_colour"]:
+def _filter(batch: dict[str, Array], basis: IsotropicBasis, signal: Array) -> Float[Array, "*batch_colour"]:
     filtered = basis._filtered(signal)  # [L+1, *colour, n]
 
     def one(w: Float[Array, "l k"], z: Float[Array, "*levels k 3"]) -> Array:
         y = jnp.broadcast_to(sh_basis(z, basis.degree), (*w.shape, signal.shape[-1]))
         return jnp.einsum("lk,lkn,l...n->...", w, y, filtered)
 
-    return _turned(one, basis, weights, rotations)
+    return _turned(one, batch, basis)
 
 
 @eqx.filter_jit
@@ -291,18 +295,24 @@ def _prefilter(basis: IsotropicBasis, signal: Array, height: int) -> Float[Array
 
 
 @eqx.filter_jit
-def _filter_maps(basis: IsotropicBasis, weights: Array, rotations: Array, texels: Array) -> Array:
+def _filter_maps(batch: dict[str, Array], basis: IsotropicBasis, texels: Array) -> Float[Array, "*batch_colour"]:
     def one(w: Float[Array, "l k"], z: Float[Array, "*levels k 3"]) -> Array:
         z = jnp.broadcast_to(z, (*w.shape, 3))
         look_up = jax.vmap(lambda image, at: sample_map(image, at, texels="samples"))
         return jnp.einsum("lk,lk...->...", w, look_up(texels, z))
 
-    return _turned(one, basis, weights, rotations)
+    return _turned(one, batch, basis)
 
 
-def _turned(one: Callable[[Array, Array], Array], basis: IsotropicBasis, weights: Array, rotations: Array) -> Array:
+def _turned(one: Callable[[Array, Array], Array], batch: dict[str, Array], basis: IsotropicBasis) -> Array:
     """one(weights, R z) for all rotations."""
-    axes = _basis.unit_axes(basis.directions).astype(weights.dtype)
-    turned = lambda a: one(a[0], jnp.einsum("ij,...j->...i", a[1], axes, precision="highest"))
-    values = jax.lax.map(turned, tuple(a.reshape(-1, *a.shape[-2:]) for a in (weights, rotations)))
-    return values.reshape(*weights.shape[:-2], *values.shape[1:])
+    shape = np.broadcast_shapes(*(a.shape[:-1] for a in batch.values()))
+    flat = {name: jnp.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for name, a in batch.items()}
+    axes = _basis.unit_axes(basis.directions).astype(flat["weights"].dtype)
+
+    def turned(row: dict[str, Array]) -> Array:
+        z = jnp.einsum("ij,...j->...i", row["rotations"].reshape(3, 3), axes, precision="highest")
+        return one(row["weights"].reshape(basis.degree + 1, basis.size), z)
+
+    values = jax.lax.map(turned, flat)
+    return values.reshape(*shape, *values.shape[1:])

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 
 from shisd import _checks
+from shisd._sharding import whole
 from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition._basis import RotatedZonalBasis, by_band, minimum_norm, padding
 
@@ -32,7 +33,7 @@ def sparse_weights(
     count = _checks.integer("count", count, 1)
     if count > basis.size:
         raise ValueError(f"`count` must be at most the {basis.size} axes of the basis; got {count}.")
-    return _choose(basis, c, count)
+    return _choose(basis, whole(c), count)
 
 
 @eqx.filter_jit

@@ -16,6 +16,7 @@ import numpy as np
 from shisd import _checks
 from shisd._module import Module
 from shisd._numerics import dot, normalize
+from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, clip, loop_solid_angle, on_sphere
@@ -81,7 +82,9 @@ class HaarBasis(Module):
         c, d = self._sized("coefficients", coefficients), _checks.vectors("directions", directions)
         if c.ndim != 1:
             raise ValueError(f"`coefficients` must be one expansion [{self.size}]; got {list(c.shape)}. Use jax.vmap.")
-        w = d.reshape(-1, 3)
+        return by_device(_evaluate, {"directions": d}, self, c)
+
+    def _values_at(self, c: Float[Array, " n"], w: Float[Array, "p 3"]) -> Float[Array, " p"]:
         below = (w < 0).astype(jnp.int32)
         cell = 4 * below[:, 2] + 2 * below[:, 1] + below[:, 0]
         for level in range(self.levels):
@@ -90,7 +93,7 @@ class HaarBasis(Module):
             cell = 4 * cell + jnp.where(jnp.any(out, axis=1), 1 + jnp.argmax(out, axis=1).astype(jnp.int32), 0)
         values = self.values(c)[cell]
         no_direction = jnp.isnan(normalize(w)).any(axis=1)
-        return (values * jnp.where(no_direction, np.nan, jnp.ones_like(values))).reshape(d.shape[:-1])
+        return values * jnp.where(no_direction, np.nan, jnp.ones_like(values))
 
     def project(self, polygon: SphericalPolygon) -> Float[Array, " n"]:
         """Coefficients of the indicator of a polygon that fits in a hemisphere, signed by its winding; exact.
@@ -107,6 +110,12 @@ class HaarBasis(Module):
         if x.ndim == 0 or x.shape[-1] != self.size:
             raise ValueError(f"`{name}` must have shape [..., {self.size}]; got {list(x.shape)}.")
         return x
+
+
+@eqx.filter_jit
+def _evaluate(batch: dict[str, Array], basis: HaarBasis, c: Float[Array, " n"]) -> Float[Array, "*batch"]:
+    d = batch["directions"]
+    return basis._values_at(c, d.reshape(-1, 3)).reshape(d.shape[:-1])
 
 
 @eqx.filter_jit

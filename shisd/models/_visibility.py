@@ -21,6 +21,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +29,7 @@ import numpy as np
 from shisd import _checks, io
 from shisd._module import Module
 from shisd._progress import Progress, reporting
+from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.domains._region import cap_coefficients
 from shisd.harmonics import _tables
@@ -87,7 +89,7 @@ class Visibility(Module):
         ValueError for triangles that do not exist, NaN under `jit`.
         """
         corners, weights = surface_corners(self, triangle, weights)
-        return jnp.einsum("...c,...cn->...n", weights, self.coefficients[corners])
+        return by_device(_interpolated, {"corners": corners, "weights": weights}, self.coefficients)
 
     @classmethod
     def from_mesh(
@@ -209,10 +211,17 @@ def surface_corners(visibility: Visibility, triangle: ArrayLike, weights: ArrayL
     if len(triangles) == 0:
         raise ValueError("`visibility` has no triangles: it is that of points, whose rows are its `coefficients`.")
     _check_range("triangle", index, len(triangles), "triangles")
-    index = jnp.asarray(index.astype(np.int32))
-    corners = triangles[index]
-    there = ((index >= 0) & (index < len(triangles)))[..., None] & (corners >= 0) & (corners < count)
-    return corners, jnp.where(there, w.astype(visibility.coefficients.dtype), np.nan)
+    batch = {"index": jnp.asarray(index.astype(np.int32))[..., None], "weights": w}
+    corners, w = by_device(_corners, batch, triangles, count)
+    return corners, w.astype(visibility.coefficients.dtype)
+
+
+@eqx.filter_jit
+def _corners(batch: dict[str, Array], triangles: Array, count: int) -> tuple[Array, Array]:
+    index, w = batch["index"], batch["weights"]
+    corners = triangles[index[..., 0]]
+    there = (index >= 0) & (index < len(triangles)) & (corners >= 0) & (corners < count)
+    return corners, jnp.where(there, w, np.nan)
 
 
 def _integers(name: str, value: ArrayLike) -> np.ndarray | Array:
@@ -222,6 +231,11 @@ def _integers(name: str, value: ArrayLike) -> np.ndarray | Array:
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"`{name}` must be integers; got {array.dtype} of shape {list(array.shape)}.")
     return array
+
+
+@jax.jit
+def _interpolated(batch: dict[str, Array], coefficients: Float[Array, "v n"]) -> Float[Array, "*batch n"]:
+    return jnp.einsum("...c,...cn->...n", batch["weights"], coefficients[batch["corners"]])
 
 
 def _known(value: ArrayLike) -> np.ndarray | None:

@@ -71,8 +71,8 @@ MUTANTS = [
     Mutant(
         "triangles that do not exist are others",
         MODEL,
-        old="jnp.where(there, w.astype",
-        new="jnp.where(there | ~there, w.astype",
+        old="jnp.where(there, w, np.nan)",
+        new="jnp.where(there | ~there, w, np.nan)",
         test=TEST + "test_triangles_that_do_not_exist_are_errors_or_nan",
     ),
     Mutant(
