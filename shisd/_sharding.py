@@ -40,8 +40,10 @@ def by_device(function: Callable[..., Any], batch: dict[str, Array], *shared: An
 
 def whole(a: Array) -> Array:
     """A batch that is worked on together, whole on every device."""
-    sharding = jax.typeof(a).sharding
-    return a if all(axis is None for axis in sharding.spec) else jax.sharding.reshard(a, NamedSharding(sharding.mesh, PartitionSpec()))
+    own = jax.typeof(a).sharding
+    if all(axis is None for axis in own.spec):
+        return a
+    return jax.sharding.reshard(a, NamedSharding(own.mesh, PartitionSpec()))
 
 
 @eqx.filter_jit

@@ -215,7 +215,8 @@ class IsotropicBasis(Module):
             ) from error
         dtype = jnp.result_type(weights, r, self.directions, signal)
         rows = {"weights": weights, "rotations": r}
-        return {name: a.astype(dtype).reshape(*a.shape[:-2], -1) for name, a in rows.items()}, signal.astype(dtype)
+        flat = lambda a: a.astype(dtype).reshape(*a.shape[:-2], a.shape[-2] * a.shape[-1])
+        return {name: flat(a) for name, a in rows.items()}, signal.astype(dtype)
 
 
 _SINGULAR = (
