@@ -1,6 +1,6 @@
 """Imports point to earlier stages only, the reference uses nothing that it judges, JAX and Equinox are used in public.
 
-Every imported name of every module is read, those of the files beside the stages too.
+Every imported name of every module is read, those of the files beside the stages too, and those of tests/truth/.
 """
 
 import ast
@@ -122,3 +122,10 @@ def test_what_no_module_may_import(place, source):
 )
 def test_what_a_module_may_import(place, source):
     assert faults(place, source) == []
+
+
+def test_truth_imports_nothing_that_it_judges():
+    paths = sorted((PACKAGE.parent / "tests" / "truth").rglob("*.py"))
+    names = [(path.name, name) for path in paths for name in imported(ast.parse(path.read_text()))]
+    others = [x for x in names if x[1].split(".")[0] in ("", "shisd", "tests") and not x[1].startswith("tests.truth.")]
+    assert names and others == []

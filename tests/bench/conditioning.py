@@ -8,13 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from numpy.polynomial import legendre as series
-from scipy.optimize import linprog
 
 from shisd import decomposition, harmonics, io, models
 from shisd._numerics import normalize
+from tests import truth
 from tests.bench.make_directions import band_matrix, worst_condition
-from tests.truth import scipy_basis
 
 KERNELS = {
     "Legendre": decomposition.LegendreKernel(),
@@ -31,29 +29,6 @@ LAYOUTS = {  # directions, whether level l has 2l+1 of them
 }
 
 
-def lower_bound(l: int, count: int) -> float:
-    """No `count` axes condition band l better than this.
-
-    With G = P_l(z_i . z_j) of trace K, the variance of the 2l+1 nonzero eigenvalues, v in units of their squared mean,
-    follows from E = sum over i != j of P_l(z_i . z_j)^2, and a ratio cond^2 of extremes allows at most
-    v = (cond - 1/cond)^2 / 4. E is bounded from below by linear programming (Delsarte; Yudin 1992): for any even
-    f = sum f_n P_n <= P_l^2 with f_n >= 0 for n > 0, all pairs, i = j too, have sum f(z_i . z_j) >= K^2 f_0, so
-    E >= K^2 f_0 - K f(1).
-    """
-    top = max(4 * l, 8) + 8
-    n = np.arange(0, top + 1, 2)
-    values = lambda x: series.legvander(x, top)[:, n]
-    square = lambda x: series.legval(x, np.eye(l + 1)[l]) ** 2
-    x = np.cos(np.linspace(0, np.pi / 2, 2000))
-    bounds = [(None, None)] + [(0, None)] * (len(n) - 1)
-    found = linprog(1 - count * (n == 0), A_ub=values(x), b_ub=square(x), bounds=bounds, method="highs")
-    fine = np.cos(np.linspace(0, np.pi / 2, 40_000))  # f is lowered where it exceeds P_l^2 between the points above
-    excess = max(np.max(values(fine) @ found.x - square(fine)), 0)
-    energy = -count * found.fun - count * (count - 1) * excess
-    variance = max((count + energy) * (2 * l + 1) / count**2 - 1, 0)
-    return np.sqrt(variance) + np.sqrt(1 + variance)
-
-
 def bench_directions(degrees=(4, 8, 12, 20, 32, 64)):
     """Worst band's condition number of 2L+1 shared axes, lower bounds, and optimising a random start in float64."""
     rows = []
@@ -65,7 +40,7 @@ def bench_directions(degrees=(4, 8, 12, 20, 32, 64)):
                 "degree": degree,
                 "table": worst_condition(table, degree),
                 "table, prefixes": worst_condition(table, degree, nested=True),
-                "no set is below": lower_bound(degree, count),
+                "no set is below": truth.condition_bound(degree, count),
                 "Fibonacci": worst_condition(np.asarray(decomposition.fibonacci_directions(count)), degree),
                 "low discrepancy": worst_condition(np.asarray(decomposition.low_discrepancy_directions(count)), degree),
             }
@@ -205,8 +180,8 @@ def picture(degree):
         c = np.asarray(harmonics.project(slice_of, degree, quadrature_degree=200))
         light = np.asarray(harmonics.project_map(texels, degree))
         w, area = (np.asarray(x) for x in harmonics.sphere_rule(2 * degree))
-    values = (scipy_basis(w, degree) @ c) * area
-    return c, light, rotations, np.array([values @ (scipy_basis(w @ r.T, degree) @ light) for r in rotations])
+    values = (truth.scipy_basis(w, degree) @ c) * area
+    return c, light, rotations, np.array([values @ (truth.scipy_basis(w @ r.T, degree) @ light) for r in rotations])
 
 
 def picture_error(kernel, directions, nested, scene, dtype):

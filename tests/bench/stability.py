@@ -14,7 +14,6 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mpmath
 import numpy as np
 import sphericart
 from scipy.special import sph_harm_y_all
@@ -278,7 +277,9 @@ def polygon_errors(cases, dtype):
         exact = truth.zonal_moments(p[::-1] if wide[i] else p, d[i], POLYGON_DEGREE, 33)
         exact = 4 * np.pi * np.eye(POLYGON_DEGREE + 1)[0] - exact if wide[i] else exact
         value = lambda x, exact=exact: cell(np.max(np.abs(np.asarray(x, float) - exact)) / abs(exact[0, 0]))
-        along = polygon_derivatives(p, d[i], weights, np.sqrt(abs(exact[0, 0])))
+        along = truth.moment_slopes(p, d[i], weights, np.sqrt(abs(exact[0, 0])))
+        # padding repeats the first vertex, which moves with it
+        along = [(argument, move if argument else padded(move), slope) for argument, move, slope in along]
         gradient = lambda x, along=along: cell(slope_error(x, along))
         take = lambda x, i=i: [np.asarray(a[i], float) for a in x]
         with np.errstate(all="ignore"):
@@ -287,37 +288,6 @@ def polygon_errors(cases, dtype):
                 (gradient(take(slopes)), gradient(take(plain_slopes))),
             )
     return errors
-
-
-def polygon_derivatives(vertices, axes, weights, size):
-    """Of the weighted sum of moments, along two motions of the vertices and two of the axes."""
-    l = np.arange(POLYGON_DEGREE + 1)
-    bands = np.repeat(l, 2 * l + 1)
-    scale = weights * 4 * np.pi / (2 * l + 1)
-
-    def total(integrals, y):
-        return np.sum((y * integrals) @ (bands[:, None] == l) * scale)
-
-    v, d = np.asarray(vertices, np.longdouble), np.asarray(axes, np.longdouble)
-    y, integrals = truth.harmonics(d, POLYGON_DEGREE)[0], truth.edge_coefficients(v, POLYGON_DEGREE)
-    rng, step, tries = np.random.default_rng(4), 1e-4 * min(1.0, float(size)), []
-    for _ in range(2):
-        move = tangential(rng, v)
-        moved = lambda t, move=move: total(truth.edge_coefficients(v + t * move, POLYGON_DEGREE), y)
-        # padding repeats the first vertex, which moves with it
-        tries.append((0, padded(move), truth.derivative(moved, step)))
-        move = tangential(rng, d)
-        turned = lambda t, move=move: total(integrals, truth.harmonics(d + t * move, POLYGON_DEGREE)[0])
-        tries.append((1, move, truth.derivative(turned, 1e-4)))
-    return tries
-
-
-def tangential(rng, directions):
-    """Random motions along the sphere."""
-    u = np.asarray(directions, float)
-    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
-    move = rng.normal(size=u.shape)
-    return move - np.sum(move * u, axis=-1, keepdims=True) * u
 
 
 def slope_error(gradients, tries, size=0.0):
@@ -371,7 +341,8 @@ def shading_rows():
     brdf = models.Ggx(0.5, 0.04)
     with jax.enable_x64(True):
         exact_slice = eqx.filter_jit(tabulated(brdf, np.float64, domain="upper").slice_coefficients)
-        expected = {name: polygon_truth(name, scene, exact_slice) for name, scene in scenes.items()}
+        slice_of = lambda view: exact_slice(jnp.asarray(view))
+        expected = {name: polygon_truth(name, scene, slice_of) for name, scene in scenes.items()}
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64):
             lobes = tabulated(brdf, dtype, domain="upper")
@@ -401,82 +372,12 @@ def tabulated(brdf, dtype, **options):
 
 
 def polygon_truth(name, scene, slice_of):
-    """Radiance of the expansion and of the material by area quadrature, and derivatives of the former, with motions."""
-    points, position, normal, view = (np.asarray(x, np.longdouble) for x in scene)
-    seen = lambda frame, view: (frame @ view / np.sqrt(view @ view)).astype(float)
-    coefficients = lambda frame, view: np.asarray(slice_of(jnp.asarray(seen(frame, view))), float)
-
-    def integrals(points, position, normal):
-        outline = outline_above(points, position, frame_of(normal))
-        return 0 * _ZEROS if outline is None else -truth.edge_coefficients(outline, SHADING_DEGREE)
-
-    frame = frame_of(normal)
-    c, outline, value, of_material = coefficients(frame, view), outline_above(points, position, frame), 0.0, 0.0
-    if outline is not None:
-        w, area = truth.triangle_rule(outline, 32)
-        value = -area @ (truth.harmonics(w, SHADING_DEGREE)[0] @ c)
-        of_material = -area @ ggx_cosine(w.astype(float), seen(frame, view), 0.5)
+    """Radiance of the expansion and of the material, and derivatives of the former, with motions."""
+    value, of_material = truth.polygon_radiance(scene, slice_of, lambda wi, wo: truth.ggx_cosine(wi, wo, 0.5))
     if "plane" in name:  # dark on one side: its derivatives
         return value, of_material, [(i, np.ones_like(x), 0.0) for i, x in enumerate(scene)]
-
-    touching = "on the horizon" in name
     step = 1e-7 if "1e-4" in name else 1e-4
-    slope = functools.partial(truth.derivative, forward=touching)
-    rng, tries = np.random.default_rng(6), []
-    b = integrals(points, position, normal)
-    for _ in range(2):
-        move = rng.normal(size=(4, 3))
-        lower = touching & (scene[0][:, 2] == 0)
-        move[lower, 2] = -np.abs(move[lower, 2])
-        tries.append((0, move, slope(lambda t, m=move: integrals(points + t * m, position, normal) @ c, step)))
-        move = rng.normal(size=3)
-        move[2] = np.abs(move[2]) if touching else move[2]
-        tries.append((1, move, slope(lambda t, m=move: integrals(points, position + t * m, normal) @ c, step)))
-        move = tangential(rng, normal)
-        if touching:
-            move = 0.3 * move - np.sum(scene[0][lower], axis=0)
-        turned = lambda t, m=move: frame_of(normal + t * m)
-        # the slice is known in float64 only: its part takes a longer step
-        change = slope(lambda t, m=move: integrals(points, position, normal + t * m) @ c, step)
-        change += truth.derivative(lambda t, turned=turned: b @ coefficients(turned(t), view), 1e-4)
-        tries.append((2, move, change))
-        move = tangential(rng, view)
-        tries.append((3, move, truth.derivative(lambda t, m=move: b @ coefficients(frame, view + t * m), 1e-4)))
-    return value, of_material, tries
-
-
-_ZEROS = np.zeros((SHADING_DEGREE + 1) ** 2, np.longdouble)
-
-
-def frame_of(normal):
-    """Any frame (rows) whose last axis is the normal."""
-    unit = lambda x: x / np.sqrt(np.sum(x * x))
-    normal = unit(normal)
-    x = unit(np.cross(normal, np.array([0.3, 0.5, -0.7], np.longdouble)))
-    return np.stack([x, np.cross(normal, x), normal])
-
-
-def outline_above(points, position, frame):
-    """Unit vertices of what is above the horizon, by plain clipping; None if nothing is, or from behind."""
-    emits = np.sum(np.cross(points - points[:1], np.roll(points, -1, 0) - points[:1]), axis=0)
-    if emits @ (position - points[0]) <= 0:
-        return None
-    local, kept = (points - position) @ frame.T, []
-    for a, b in zip(local, np.roll(local, -1, axis=0), strict=True):
-        kept += [a] if a[2] > 0 else []
-        kept += [a + (b - a) * (a[2] / (a[2] - b[2]))] if (a[2] > 0) != (b[2] > 0) else []
-    return np.stack([p / np.sqrt(p @ p) for p in kept]) if kept else None
-
-
-def ggx_cosine(wi, wo, alpha, xp=np):
-    """GGX of f0 = 0.04 times the cosine, as textbooks have it (Walter et al. 2007, Eq. 20, 33, 34); wi [..., 3]."""
-    half = wi + wo
-    half = half / xp.sqrt(xp.sum(half * half, axis=-1, keepdims=True))
-    cos_h, cos_i, cos_o = half[..., 2], wi[..., 2], wo[..., 2]
-    d = alpha**2 / (np.pi * (cos_h**2 * (alpha**2 - 1) + 1) ** 2)
-    g1 = lambda cosine: 2 / (1 + xp.sqrt(1 + alpha**2 * (1 - cosine**2) / cosine**2))
-    fresnel = 0.04 + 0.96 * (1 - xp.sum(half * wo, axis=-1)) ** 5
-    return xp.where((cos_i > 0) & (cos_o > 0), d * fresnel * g1(cos_i) * g1(cos_o) / (4 * cos_o), 0)
+    return value, of_material, truth.polygon_slopes(scene, slice_of, step=step, touching="on the horizon" in name)
 
 
 # ---- shading by an environment
@@ -490,7 +391,7 @@ def roughness_rows():
     e = bands[l] * 4 * np.pi / (2 * l + 1) * truth.scipy_basis(pole, SHADING_DEGREE)
     light = lambda w: np.polynomial.legendre.legval(w @ pole, bands)
     node = (28 + 0.5) * np.pi / 128
-    seen = lambda theta: frame_of(normal).T.astype(float) @ [np.sin(theta), 0.0, np.cos(theta)]
+    seen = lambda theta: truth.frame_of(normal).T.astype(float) @ [np.sin(theta), 0.0, np.cos(theta)]
     cases = {
         "roughness 0.02 to radiance": (0.02, seen(node)),
         "roughness 1 to radiance": (1.0, seen(node)),
@@ -498,7 +399,7 @@ def roughness_rows():
         "view at the normal, environment": (0.5, normal),
     }
     results = {name: [] for name in cases}
-    exact = {name: environment_truth(alpha, normal, view, light) for name, (alpha, view) in cases.items()}
+    exact = {name: truth.ggx_radiance(alpha, normal, view, light) for name, (alpha, view) in cases.items()}
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64):
 
@@ -523,32 +424,6 @@ def roughness_rows():
     return beside_monte_carlo(results)
 
 
-def environment_truth(alpha, normal, view, light):
-    """Radiance, and its derivatives in alpha, normal and view, by a product rule over the hemisphere."""
-    count = 600 if alpha < 0.1 else 200
-    x, weights = np.polynomial.legendre.leggauss(count)
-    z, phi = (x + 1) / 2, (np.arange(2 * count) + 0.5) * np.pi / count
-    sine = np.sqrt(1 - z * z)[:, None]
-    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.broadcast_to(z[:, None], (count, len(phi)))], axis=-1)
-    wi, area = wi.reshape(-1, 3), np.repeat(weights / 2 * np.pi / count, len(phi))
-
-    def radiance(alpha, normal, view):
-        frame = frame_of(normal).astype(float)
-        wo = frame @ (view / np.sqrt(view @ view))
-        return np.sum(area * ggx_cosine(wi, wo, alpha) * light(wi @ frame))
-
-    rng, step = np.random.default_rng(8), 0.01 * min(alpha, 0.1)
-    tries = [(0, 1.0, truth.derivative(lambda t: radiance(alpha + t, normal, view), step))]
-    for argument in (1, 2):
-        move = tangential(rng, (normal, view)[argument - 1])
-        moved = (
-            (lambda t, m=move: radiance(alpha, normal + t * m, view)) if argument == 1
-            else (lambda t, m=move: radiance(alpha, normal, view + t * m))
-        )  # fmt: skip
-        tries.append((argument, move, truth.derivative(moved, min(step, 5e-4))))
-    return radiance(alpha, normal, view), tries
-
-
 # ---- materials
 
 
@@ -563,7 +438,7 @@ def material_rows():
 
 def material_errors(alpha, wi, wo, dtype):
     arguments = [jnp.asarray(x, dtype) for x in (alpha, wi, wo)]
-    exact, *slopes = material_truth(*(np.asarray(x, float) for x in arguments))
+    exact, *slopes = truth.ggx_to_fifty_digits(*(np.asarray(x, float) for x in arguments))
     errors = []
     for run in (_our_material, _textbook):
         value, gradient = run(*arguments)
@@ -582,34 +457,8 @@ _our_material = jax.jit(
     jax.value_and_grad(lambda alpha, wi, wo: models.Ggx(alpha, 0.04).value_cosine(wi, wo), (0, 1, 2))
 )
 _textbook = jax.jit(
-    jax.value_and_grad(lambda alpha, wi, wo: ggx_cosine(wi, wo, alpha, jnp).astype(wi.dtype), (0, 1, 2))
+    jax.value_and_grad(lambda alpha, wi, wo: truth.ggx_cosine(wi, wo, alpha, jnp).astype(wi.dtype), (0, 1, 2))
 )
-
-
-def material_truth(alpha, wi, wo):
-    """The textbook's formula in fifty digits: value, and derivatives in alpha and along the sphere in wi and wo."""
-    with mpmath.workdps(50):
-        vector = lambda x: mpmath.matrix([mpmath.mpf(float(v)) for v in x])
-        unit = lambda x: x / mpmath.norm(x)
-
-        def value(alpha, wi, wo):
-            wi, wo = unit(wi), unit(wo)
-            half = unit(wi + wo)
-            d = alpha**2 / (mpmath.pi * (half[2] ** 2 * (alpha**2 - 1) + 1) ** 2)
-            g1 = lambda c: 2 / (1 + mpmath.sqrt(1 + alpha**2 * (1 - c**2) / c**2))
-            cosine = sum(half[i] * wo[i] for i in range(3))
-            fresnel = mpmath.mpf("0.04") + mpmath.mpf("0.96") * (1 - cosine) ** 5
-            return d * fresnel * g1(wi[2]) * g1(wo[2]) / (4 * wo[2])
-
-        a, wi, wo, h = mpmath.mpf(float(alpha)), vector(wi), vector(wo), mpmath.mpf("1e-15")
-        slope = lambda f: float((f(h) - f(-h)) / (2 * h))
-        steps = [vector(s) for s in np.eye(3)]
-        return (
-            float(value(a, wi, wo)),
-            slope(lambda t: value(a + t, wi, wo)),
-            np.array([slope(lambda t, s=s: value(a, wi + t * s, wo)) for s in steps]),
-            np.array([slope(lambda t, s=s: value(a, wi, wo + t * s)) for s in steps]),
-        )
 
 
 def measured_rows():
@@ -618,10 +467,9 @@ def measured_rows():
     directions = rng.normal(size=(2, 200, 3)) * [1, 1, 0.5] + [0, 0, 1.2]
     wi, wo = unit(np.abs(directions) * [1, 1, 1])
     wi[:, :2] *= rng.choice([-1, 1], (200, 2))
-    exact = ggx_cosine(wi, wo, alpha)
-    move = np.stack([tangential(rng, w) for w in wi])
-    slopes = lambda t: ggx_cosine((wi + t * move) / np.linalg.norm(wi + t * move, axis=1, keepdims=True), wo, alpha)
-    slopes = truth.derivative(slopes, 1e-3)
+    exact = truth.ggx_cosine(wi, wo, alpha)
+    move = np.stack([truth.tangential(rng, w) for w in wi])
+    slopes = truth.derivative(lambda t: truth.ggx_cosine(unit(wi + t * move), wo, alpha), 1e-3)
     rms = lambda got, expected: np.sqrt(np.mean((np.asarray(got, float) - expected) ** 2) / np.mean(expected**2))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "holes.binary"
@@ -638,7 +486,7 @@ def measured_rows():
                 brdf = models.MeasuredBrdf.from_merl(path, dtype=dtype)
             f = lambda wi, wo: brdf.value_cosine(wi, wo)[0]
             value, gradient = jax.jit(jax.vmap(jax.value_and_grad(f)))(*(jnp.asarray(w, dtype) for w in (wi, wo)))
-            published = nearest_bin(planes[0].reshape(90, 90, 180) / 1500, wi, wo) * wi[:, 2]
+            published = truth.nearest_bin(planes[0].reshape(90, 90, 180) / 1500, wi, wo) * wi[:, 2]
             return (
                 cell(rms(value, exact)),
                 cell(rms(np.sum(np.asarray(gradient, float) * move, axis=1), slopes)),
@@ -655,18 +503,6 @@ def measured_rows():
     ]
 
 
-def nearest_bin(plane, wi, wo):
-    """The table's bins as they are, at half and difference angles (Rusinkiewicz 1998), as published with the data."""
-    half = unit(wi + wo)
-    theta_h, phi_h = np.arccos(np.clip(half[:, 2], -1, 1)), np.arctan2(half[:, 1], half[:, 0])
-    cos, sin = np.cos(phi_h), np.sin(phi_h)
-    x, y, z = cos * wi[:, 0] + sin * wi[:, 1], cos * wi[:, 1] - sin * wi[:, 0], wi[:, 2]
-    x, z = np.cos(theta_h) * x - np.sin(theta_h) * z, np.sin(theta_h) * x + np.cos(theta_h) * z
-    theta_d, phi_d = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x) % np.pi
-    at = (90 * np.sqrt(theta_h / (np.pi / 2)), 90 * theta_d / (np.pi / 2), 180 * phi_d / np.pi)
-    return plane[tuple(np.clip(i.astype(int), 0, n - 1) for i, n in zip(at, plane.shape, strict=True))]
-
-
 # ---- distant light
 
 
@@ -674,19 +510,20 @@ def light_rows():
     rng = np.random.default_rng(11)
     normals = unit(rng.normal(size=(8, 3)))
     views = unit(normals + 0.6 * unit(rng.normal(size=(8, 3))))
-    mix, motion = rng.normal(size=8), [rng.normal(size=(16, 32)), tangential(rng, normals), tangential(rng, views)]
+    mix = rng.normal(size=8)
+    motion = [rng.normal(size=(16, 32)), truth.tangential(rng, normals), truth.tangential(rng, views)]
     brdf = models.Ggx(0.5, 0.04)
     clean = np.nan_to_num(hard_cases.BAD_TEXELS, nan=0.0, posinf=65504.0)  # of half precision the largest
     maps = hard_cases.LIGHTS | {"NaN and infinite texels, from a file": clean}
     with jax.enable_x64(True):
         slice_of = jax.jit(jax.vmap(tabulated(brdf, np.float64).slice_coefficients))
-        exact = {}
+        local, exact = functools.partial(truth.environment_radiance, slice_of), {}
         for name, texels in maps.items():
-            e, local = map_coefficients(texels), lambda e, n, v: environment_radiance(slice_of, e, n, v)
+            e = truth.map_coefficients(texels, SHADING_DEGREE)
             along = [
-                mix @ local(map_coefficients(motion[0]), normals, views),
-                truth.derivative(lambda t, e=e, local=local: mix @ local(e, normals + t * motion[1], views), 1e-4),
-                truth.derivative(lambda t, e=e, local=local: mix @ local(e, normals, views + t * motion[2]), 1e-4),
+                mix @ local(truth.map_coefficients(motion[0], SHADING_DEGREE), normals, views),
+                truth.derivative(lambda t, e=e: mix @ local(e, normals + t * motion[1], views), 1e-4),
+                truth.derivative(lambda t, e=e: mix @ local(e, normals, views + t * motion[2]), 1e-4),
             ]
             quadrature = reference.shade_environment_quadrature(
                 brdf, models.Environment(texels), normals, views, supersampling=8
@@ -740,32 +577,6 @@ def light_rows():
         if gradient[0] is not None:
             rows.append(row(name, "gradient", gradient))
     return rows
-
-
-def map_coefficients(texels):
-    """Coefficients of a map that is constant on each texel, by a Gauss rule in each."""
-    height, width = texels.shape
-    x, weights = np.polynomial.legendre.leggauss(8)
-    theta, phi = (np.pi / height * (np.arange(n)[:, None] + (x + 1) / 2).reshape(-1) for n in (height, width))
-    sine, cosine = np.sin(theta)[:, None], np.cos(theta)[:, None]
-    w = np.stack(np.broadcast_arrays(sine * np.cos(phi), sine * np.sin(phi), cosine), axis=-1)
-    area = np.outer(np.tile(weights, height) * np.sin(theta), np.tile(weights, width)) * (np.pi / height / 2) ** 2
-    values = np.repeat(np.repeat(texels, 8, axis=0), 8, axis=1)
-    return (values * area).reshape(-1) @ truth.scipy_basis(w.reshape(-1, 3), SHADING_DEGREE)
-
-
-def environment_radiance(slice_of, e, normals, views):
-    """Integrals of slice times light, by a product rule that is exact."""
-    x, weights = np.polynomial.legendre.leggauss(SHADING_DEGREE + 2)
-    phi = 2 * np.pi * np.arange(2 * SHADING_DEGREE + 2) / (2 * SHADING_DEGREE + 2)
-    sine, cosine = np.sqrt(1 - x * x)[:, None], x[:, None]
-    w = np.stack(np.broadcast_arrays(sine * np.cos(phi), sine * np.sin(phi), cosine), axis=-1).reshape(-1, 3)
-    area = np.repeat(weights * 2 * np.pi / len(phi), len(phi))
-    frames = np.stack([frame_of(n) for n in normals]).astype(float)
-    slices = np.asarray(slice_of(jnp.asarray(np.einsum("pij,pj->pi", frames, np.asarray(views, float)))))
-    lobe = slices @ truth.scipy_basis(w, SHADING_DEGREE).T
-    light = truth.scipy_basis(np.einsum("qi,pij->pqj", w, frames), SHADING_DEGREE) @ e
-    return np.sum(area * lobe * light, axis=1)
 
 
 def write_exr(path, texels):

@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 
 from shisd import decomposition
 from shisd.decomposition import RotatedZonalBasis
-from tests.decomposition import truth
+from tests import truth
 from tests.marks import FLOAT32_FIRST
 
 SETS = {
@@ -78,7 +78,7 @@ def test_weights_are_those_of_least_norm(name, x64, rng):
     degree = 6
     z, c = SETS[name](degree), rng.standard_normal((4, 49))
     w = np.asarray(weights_of(RotatedZonalBasis(z, degree), c))
-    for l, m in enumerate(truth.matrices(z, degree)):
+    for l, m in enumerate(truth.band_matrices(z, degree)):
         expected = band(c, l) @ np.linalg.pinv(m).T
         np.testing.assert_allclose(w[:, l], expected, atol=1e-14 * np.linalg.cond(m) ** 2)
 
@@ -87,7 +87,7 @@ def test_nested_weights_solve_the_prefix(x64, rng):
     degree = 6
     z, c = decomposition.optimized_directions(degree), rng.standard_normal(49)
     w = np.asarray(weights_of(RotatedZonalBasis(z, degree, nested=True), c))
-    for l, m in enumerate(truth.matrices(z, degree)):
+    for l, m in enumerate(truth.band_matrices(z, degree)):
         used = slice(2 * l + 1)
         np.testing.assert_allclose(w[l, used], np.linalg.solve(m[:, used], band(c, l)), rtol=1e-11, atol=1e-12)
         assert np.all(w[l, 2 * l + 1 :] == 0)
@@ -103,7 +103,7 @@ def test_evaluation_equals_the_expansion(degree, nested, dtype, rng):
     weights = weights_of(basis, c)
     got = evaluate_of(basis, weights, w)
     assert got.shape == (3, 7) and got.dtype == dtype
-    expected = truth.sh(np.reshape(w, (-1, 3)).astype(np.float64), degree) @ c
+    expected = truth.scipy_basis(np.reshape(w, (-1, 3)).astype(np.float64), degree) @ c
     scale = np.sqrt((2 * degree + 1) / (4 * np.pi)) * np.abs(np.asarray(weights)).sum()
     np.testing.assert_allclose(np.ravel(got), expected, atol=10 * np.finfo(dtype).eps * scale)
 
@@ -122,7 +122,7 @@ def test_nested_basis_ignores_weights_outside_its_prefixes(x64, rng):
     basis = RotatedZonalBasis(decomposition.optimized_directions(3), 3, nested=True)
     w, at = rng.standard_normal((4, 7)), unit(rng, 5)
     c = coefficients_of(basis, w)
-    np.testing.assert_allclose(evaluate_of(basis, w, at), truth.sh(at, 3) @ np.asarray(c), atol=1e-13)
+    np.testing.assert_allclose(evaluate_of(basis, w, at), truth.scipy_basis(at, 3) @ np.asarray(c), atol=1e-13)
 
 
 def test_rotating_the_axes_rotates_the_function(x64, rng):
@@ -133,7 +133,7 @@ def test_rotating_the_axes_rotates_the_function(x64, rng):
     np.testing.assert_allclose(evaluate_of(turned, w, at), evaluate_of(plain, w, at @ rotation), atol=1e-13)
     np.testing.assert_allclose(conditions_of(turned), conditions_of(plain), rtol=1e-12)
     np.testing.assert_allclose(
-        truth.sh(at, 5) @ np.asarray(coefficients_of(turned, w)), evaluate_of(turned, w, at), atol=1e-13
+        truth.scipy_basis(at, 5) @ np.asarray(coefficients_of(turned, w)), evaluate_of(turned, w, at), atol=1e-13
     )
 
 
@@ -290,7 +290,7 @@ def test_a_basis_changed_by_gradient_steps_stays_consistent(x64, rng):
     c, at = rng.standard_normal(16), unit(rng, 6)
     loss = lambda b: jnp.sum(b.evaluate(b.weights(c), at) ** 2)
     value, gradient = eqx.filter_jit(eqx.filter_value_and_grad(loss))(basis)
-    np.testing.assert_allclose(value, np.sum((truth.sh(at, 3) @ c) ** 2), rtol=1e-12)
+    np.testing.assert_allclose(value, np.sum((truth.scipy_basis(at, 3) @ c) ** 2), rtol=1e-12)
     np.testing.assert_allclose(gradient.directions, np.zeros((7, 3)), atol=1e-12 * value)
 
 

@@ -12,8 +12,7 @@ import pytest
 from jax.test_util import check_grads
 
 from shisd import decomposition
-from tests.bench import conditioning
-from tests.decomposition import truth
+from tests import truth
 from tests.marks import FLOAT64_FIRST
 
 SETS = {
@@ -108,7 +107,7 @@ def test_table_is_as_well_conditioned_as_documented(degree, x64):
     assert z.shape == (2 * degree + 1, 3) and np.all(z[:, 2] >= 0)
     np.testing.assert_allclose(np.linalg.norm(z, axis=1), 1, atol=1e-15)
     assert degree == 0 or smallest_angle(z) > 0.25 * np.sqrt(2 * np.pi / len(z))
-    matrices = truth.matrices(z, degree)
+    matrices = truth.band_matrices(z, degree)
     conditions = np.array([np.linalg.cond(m) for m in matrices])
     prefixes = np.array([np.linalg.cond(m[:, : 2 * l + 1]) for l, m in enumerate(matrices)])
     known = {4: (2.3, 5.71), 8: (2.95, 5.9), 12: (4.4, 29.2), 20: (6.5, 150.2), 32: (8.9, 130), 64: (15.1, 376)}
@@ -125,7 +124,7 @@ def test_table_is_small():
 
 @pytest.mark.parametrize("degree", [1, 4, pytest.param(8, marks=pytest.mark.slow)])
 def test_no_set_beats_the_lower_bounds(degree, x64):
-    bound = conditioning.lower_bound(degree, 2 * degree + 1)
+    bound = truth.condition_bound(degree, 2 * degree + 1)
     assert bound > 1.6 or degree == 1
     for z in (
         decomposition.optimized_directions(degree),
@@ -149,7 +148,7 @@ def test_the_package_finds_the_same_conditions(degree, dtype):
 
 
 def independent_loss(z, degree, power, nested=False, bands=None):
-    total, matrices = 0.0, truth.matrices(z, degree)
+    total, matrices = 0.0, truth.band_matrices(z, degree)
     for l in bands or range(degree + 1):
         m = matrices[l][:, : 2 * l + 1] if nested else matrices[l]
         mu = np.linalg.svd(m, compute_uv=False) ** 2 * (2 * l + 1) / m.shape[1]

@@ -8,7 +8,7 @@ import pytest
 
 from shisd import decomposition
 from shisd.decomposition import IsotropicBasis, RotatedZonalBasis
-from tests.decomposition import truth
+from tests import truth
 from tests.marks import FLOAT32_FIRST
 
 DEGREE = 5
@@ -86,7 +86,7 @@ def test_the_matrix_is_the_projection_of_the_kernels(name, x64):
     t, p = (g.ravel() for g in np.meshgrid(theta, phi, indexing="ij"))
     w = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
     area = np.sin(t) * (np.pi / nodes) ** 2
-    y = truth.sh(w, degree)
+    y = truth.scipy_basis(w, degree)
     for l, k in ((0, 0), (1, 2), (2, 5), (3, 6)):
         values = np.asarray(kernel(w @ np.asarray(z[l, k]), l)) * area
         limit = 2e-3 if name == "discs" else 2e-5  # what the midpoint rule leaves
@@ -111,7 +111,7 @@ def test_zonal_harmonics_are_the_rotated_zonal_basis(nested, x64, rng):
     np.testing.assert_allclose(ours.coefficients(weights), theirs.coefficients(weights), atol=1e-13)
     w = unit(rng, 6)
     np.testing.assert_allclose(ours.evaluate(weights[0], w), theirs.evaluate(weights[0], w), atol=1e-12)
-    bands = truth.matrices(z, DEGREE)
+    bands = truth.band_matrices(z, DEGREE)
     singular = [np.linalg.svd(m[:, : 2 * l + 1] if nested else m, compute_uv=False) for l, m in enumerate(bands)]
     expected = max(s[0] for s in singular) / min(s[-1] for s in singular)
     np.testing.assert_allclose(ours.condition_number(), expected, rtol=1e-10)
@@ -141,7 +141,7 @@ def test_ridge_cures_axes_that_levels_share(rng):
     with pytest.raises(RuntimeError, match="separate_directions"):
         basis.weights(c)
     found = basis.solve(c, ridge=1e-6)
-    y = truth.sh(np.asarray(z, float), 7)  # [K, n]
+    y = truth.scipy_basis(np.asarray(z, float), 7)  # [K, n]
     x, gauss = np.polynomial.legendre.leggauss(200)
     m = np.zeros((64, 8, 15))
     bands = np.repeat(np.arange(8), 2 * np.arange(8) + 1)
@@ -187,8 +187,9 @@ def test_filtering_is_the_integral_of_signal_times_turned_kernel(name, dtype, rn
     z, phi = (g.ravel() for g in np.meshgrid(theta, np.arange(24) * np.pi / 12, indexing="ij"))
     w = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
     area = np.repeat(weight, 24) * np.pi / 12
-    kernel = truth.sh(w, DEGREE) @ np.asarray(c, float)[:, 0].T  # [w, 4] in the local frame
-    expected = np.stack([(kernel * area[:, None]).T @ (truth.sh(w @ a.T, DEGREE) @ signal.T) for a in r], axis=1)
+    kernel = truth.scipy_basis(w, DEGREE) @ np.asarray(c, float)[:, 0].T  # [w, 4] in the local frame
+    turned = [truth.scipy_basis(w @ a.T, DEGREE) @ signal.T for a in r]
+    expected = np.stack([(kernel * area[:, None]).T @ x for x in turned], axis=1)
     limit = 10 * np.finfo(dtype).eps * float(basis.condition_number())
     np.testing.assert_allclose(got, expected, atol=limit * np.abs(expected).max())
 
