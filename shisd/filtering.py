@@ -31,11 +31,11 @@ from shisd import _checks, io
 from shisd._numerics import normalize, safe_sqrt
 from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.decomposition._kernels import gaussian_zonal
-from shisd.harmonics import _tables, sh_basis
+from shisd.decomposition.internal import gaussian_zonal
+from shisd.harmonics import sh_basis
+from shisd.harmonics.internal import bands, zonal_norms
 from shisd.models import MeasuredBrdf, ProjectedBrdf
-from shisd.models._measured import fill_nearest
-from shisd.models._projected import symmetric
+from shisd.models.internal import fill_nearest, symmetric
 
 _TILE = 1024  # samples whose harmonics are in memory at a time
 _SMOOTHNESS = (1.0, 10.0, 100.0, 1000.0)  # what is tried for tables
@@ -149,7 +149,7 @@ def _fit(
 
         return jax.lax.scan(add, (jnp.zeros_like(c), jnp.zeros((), c.dtype)), tiles)[0]
 
-    l = np.arange(degree + 1) if isotropic else _tables.bands(degree)
+    l = np.arange(degree + 1) if isotropic else bands(degree)
     curvature = ((l * (l + 1))[:, None] + (l * (l + 1))[None, :]) ** 2.0
     repeats = np.where(np.arange(degree + 1) > 0, 2, 1)[:, None, None] if isotropic else 1  # cosines and sines
     share = jnp.asarray(repeats / (16 * np.pi**2), y.dtype)  # of a squared coefficient in the mean over sphere x sphere
@@ -240,7 +240,7 @@ def smooth_brdf(brdf: ProjectedBrdf, kappa: ArrayLike) -> ProjectedBrdf:
     kappa = _checks.scalar("kappa", kappa)
     c, degree = brdf.coefficients, brdf.degree
     factor = _von_mises_fisher(kappa.astype(c.dtype), degree)
-    factor = factor if brdf.isotropic else factor[_tables.bands(degree)]
+    factor = factor if brdf.isotropic else factor[bands(degree)]
     both = jnp.broadcast_to(factor[:, None] * factor[None, :], c.shape)
     return ProjectedBrdf(c * both, isotropic=brdf.isotropic, clamp=brdf.clamp)
 
@@ -248,7 +248,7 @@ def smooth_brdf(brdf: ProjectedBrdf, kappa: ArrayLike) -> ProjectedBrdf:
 def _von_mises_fisher(kappa: Scalar, degree: int) -> Float[Array, " bands"]:
     """k_l / pi_l, with k_0 / pi_0 = 1."""
     kappa = eqx.error_if(kappa, ~(kappa >= 0), "`kappa` must be >= 0.")
-    k = gaussian_zonal(jnp.minimum(kappa, 1e8), degree) / jnp.asarray(_tables.zonal_norms(degree), kappa.dtype)
+    k = gaussian_zonal(jnp.minimum(kappa, 1e8), degree) / jnp.asarray(zonal_norms(degree), kappa.dtype)
     return jnp.concatenate([jnp.ones_like(k[:1]), k[1:] / k[0]])
 
 

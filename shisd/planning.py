@@ -29,8 +29,9 @@ from shisd._module import Module
 from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import RotatedZonalBasis, optimized_directions
-from shisd.decomposition._directions import TABLE_DEGREE
-from shisd.harmonics import _tables, convolve, evaluate, multiply, sphere_rule
+from shisd.decomposition.internal import TABLE_DEGREE
+from shisd.harmonics import convolve, evaluate, multiply, sphere_rule
+from shisd.harmonics.internal import host_basis, zonal_norms
 from shisd.models import AbstractBrdf, Environment, PolygonLight, PortalLight
 from shisd.shading import (
     Lobes,
@@ -41,8 +42,7 @@ from shisd.shading import (
     shade_zonal,
     tabulate_brdf,
 )
-from shisd.shading._lobes import RIDGE, fit_above, hemisphere_blocks, project_slice
-from shisd.shading._polygon import incident_radiance
+from shisd.shading.internal import RIDGE, fit_above, hemisphere_blocks, incident_radiance, project_slice
 
 Light = Environment | PolygonLight | PortalLight | ArrayLike
 _ELEVATIONS = 12  # of the views whose slices are judged: Gauss nodes
@@ -480,7 +480,7 @@ class _Distant:
     def axis(self) -> np.ndarray:
         """Of the principal axes of its first and second moments, the one about which most of it is zonal."""
         w, area = (np.asarray(x, float) for x in sphere_rule(4))
-        values = _tables.basis(w, 2) @ self.coefficients[:, :9].T * area[:, None]
+        values = host_basis(w, 2) @ self.coefficients[:, :9].T * area[:, None]
         first, second = values.T @ w, np.einsum("pc,pi,pj->cij", values, w, w)
         moments = np.stack([first.T @ first, np.einsum("cij,cjk->ik", second, second)])
         axes = np.concatenate([*np.swapaxes(np.linalg.eigh(moments)[1], 1, 2), np.eye(3)[2:]])
@@ -492,8 +492,8 @@ class _Distant:
     def _about(self, axis: np.ndarray) -> np.ndarray:
         """Coefficients [C, l] of y_l^0 about an axis."""
         degree = self.norms.shape[-1] - 1
-        products = self.coefficients * _tables.basis(axis[None], degree)
-        return np.add.reduceat(products, np.arange(degree + 1) ** 2, axis=-1) / _tables.zonal_norms(degree)
+        products = self.coefficients * host_basis(axis[None], degree)
+        return np.add.reduceat(products, np.arange(degree + 1) ** 2, axis=-1) / zonal_norms(degree)
 
     @property
     def zonal(self) -> np.ndarray:
@@ -503,8 +503,8 @@ class _Distant:
     def off_axis(self) -> np.ndarray:
         """Norms [C, 1, l] of what is not zonal about the axis."""
         degree = self.norms.shape[-1] - 1
-        part = np.repeat(self.zonal / _tables.zonal_norms(degree), 2 * np.arange(degree + 1) + 1, axis=-1)
-        return _norms(self.coefficients - part * _tables.basis(self.axis[None], degree))[:, None]
+        part = np.repeat(self.zonal / zonal_norms(degree), 2 * np.arange(degree + 1) + 1, axis=-1)
+        return _norms(self.coefficients - part * host_basis(self.axis[None], degree))[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -690,8 +690,8 @@ class _Tables:
 
 def _band_matrices(degree: int) -> list[np.ndarray]:
     """M_l of the optimised axes (ISD15 Eq. 10), for every band."""
-    y = _tables.basis(np.asarray(optimized_directions(degree), float), degree)
-    norms = _tables.zonal_norms(degree)
+    y = host_basis(np.asarray(optimized_directions(degree), float), degree)
+    norms = zonal_norms(degree)
     return [y[:, l * l : (l + 1) ** 2].T / norms[l] for l in range(degree + 1)]
 
 

@@ -27,8 +27,8 @@ from jax.typing import DTypeLike
 from shisd import _checks
 from shisd._module import Module
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.harmonics import _quadrature, _tables, legendre, zonal_basis
-from shisd.harmonics._zh import legendre_of_versine
+from shisd.harmonics import legendre, zonal_basis
+from shisd.harmonics.internal import gauss_rows, legendre_of_versine, zonal_norms
 
 
 def _per_level(name: str) -> Callable[[ArrayLike | None], Array | None]:
@@ -151,7 +151,7 @@ class GaussLegendreKernel(_BellKernel):
         k = self._sharpness(degree, dtype)
         t, p, weights = _near_axis(_extent(k), degree, degree + _NODES)
         levels = np.arange(degree + 1, dtype=np.int32)
-        own = p[levels, :, levels] / jnp.asarray(_tables.zonal_norms(degree), k.dtype)[:, None]  # P_l at its own nodes
+        own = p[levels, :, levels] / jnp.asarray(zonal_norms(degree), k.dtype)[:, None]  # P_l at its own nodes
         return jnp.einsum("lq,lqn->ln", weights * jnp.exp(-k[:, None] * t) * own, p)
 
 
@@ -179,7 +179,7 @@ class PhongKernel(AbstractKernel):
         even, odd = (jnp.cumprod(steps[:, i::2], axis=1) for i in (0, 1))
         integrals = jnp.zeros((degree + 1, degree + 1), a.dtype).at[:, 0::2].set(even).at[:, 1::2].set(odd)
         integrals = jnp.where(a == 0, jnp.where(n == 0, 2, 0).astype(a.dtype), integrals)
-        return integrals * jnp.asarray(2 * np.pi * _tables.zonal_norms(degree), a.dtype)[None]
+        return integrals * jnp.asarray(2 * np.pi * zonal_norms(degree), a.dtype)[None]
 
     def _exponents(self, degree: int, dtype: DTypeLike) -> Float[Array, " levels"]:
         return _widths(self.exponents, degree, lambda l: 4 * l, dtype)
@@ -278,9 +278,9 @@ def _near_axis(h: Float[Array, " k"], degree: int, nodes: int) -> tuple[Array, A
 
     The factors sqrt((2n+1) / 4 pi) of y_n^0 are in the second.
     """
-    theta, gauss = _quadrature.gauss_rows(nodes)
+    theta, gauss = gauss_rows(nodes)
     t = h[:, None] * jnp.asarray(np.sin(theta / 2) ** 2, h.dtype)[None]
-    p = legendre_of_versine(t, degree) * jnp.asarray(_tables.zonal_norms(degree), h.dtype)[None, None]
+    p = legendre_of_versine(t, degree) * jnp.asarray(zonal_norms(degree), h.dtype)[None, None]
     return t, p, h[:, None] * jnp.asarray(np.pi * gauss, h.dtype)[None]
 
 

@@ -21,12 +21,13 @@ from shisd import _checks
 from shisd._numerics import dot, normalize, same_dtype
 from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import fibonacci_directions, optimized_directions
-from shisd.decomposition._directions import TABLE_DEGREE
+from shisd.decomposition.internal import TABLE_DEGREE
 from shisd.domains import _moments
 from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, loop_solid_angle
 from shisd.domains._region import SphericalCap, cap_coefficients, cap_integrals
-from shisd.harmonics import _tables, legendre
+from shisd.harmonics import legendre
+from shisd.harmonics.internal import host_basis
 
 Region = SphericalPolygon | SphericalCap
 
@@ -190,5 +191,5 @@ def incidence_inverse(degree: int, dtype: DTypeLike) -> tuple[np.ndarray, list[n
 
 def _inverses(axes: np.ndarray, degree: int, rows: Callable[[int], slice]) -> list[np.ndarray]:
     z = axes.astype(float)
-    y = _tables.basis(z / np.linalg.norm(z, axis=1, keepdims=True), degree)
+    y = host_basis(z / np.linalg.norm(z, axis=1, keepdims=True), degree)
     return [np.linalg.pinv(4 * np.pi / (2 * l + 1) * y[:, rows(l)]).astype(axes.dtype) for l in range(degree + 1)]

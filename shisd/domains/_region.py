@@ -7,8 +7,8 @@ from shisd import _checks
 from shisd._module import Module
 from shisd._numerics import normalize
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.harmonics import _tables, sh_basis
-from shisd.harmonics._zh import legendre_of_versine
+from shisd.harmonics import sh_basis
+from shisd.harmonics.internal import bands, legendre_of_versine
 
 
 class SphericalCap(Module):
@@ -52,7 +52,7 @@ def cap_integrals(versine: Float[Array, "*batch"], degree: int) -> Float[Array, 
 
 def cap_coefficients(versine: Float[Array, "*batch"], axis: Float[Array, "*batch 3"], degree: int) -> Array:
     """SH coefficients [..., n] of the indicators of caps about axes [..., 3], of any length but zero."""
-    return cap_integrals(versine, degree)[..., np.asarray(_tables.bands(degree))] * sh_basis(axis, degree)
+    return cap_integrals(versine, degree)[..., np.asarray(bands(degree))] * sh_basis(axis, degree)
 
 
 def hemisphere(normal: ArrayLike) -> SphericalCap:

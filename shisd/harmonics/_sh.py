@@ -70,7 +70,7 @@ def evaluate(coefficients: ArrayLike, directions: ArrayLike) -> Float[Array, "*b
 
 @functools.partial(jax.jit, static_argnums=1)
 def _jitted_basis(batch: dict[str, Float[Array, "*batch 3"]], degree: int) -> Float[Array, "*batch n"]:
-    return _basis(normalize(batch["directions"]), degree)
+    return basis_at(normalize(batch["directions"]), degree)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -79,14 +79,14 @@ def _evaluate(batch: dict[str, Array], degree: int) -> Float[Array, "*batch"]:
     c, u = batch["coefficients"], normalize(batch["directions"])
     rank = c.ndim - 1
     if any(i > 1 and j > 1 for i, j in zip(c.shape[:-1], u.shape[:-1], strict=True)):
-        return jnp.sum(c * _basis(u, degree), axis=-1)
+        return jnp.sum(c * basis_at(u, degree), axis=-1)
     values = _expand(c.reshape(-1, c.shape[-1]), u.reshape(-1, 3), degree)
     values = values.reshape(c.shape[:-1] + u.shape[:-1])
     pairs = [axis for pair in zip(range(rank), range(rank, 2 * rank), strict=True) for axis in pair]
     return values.transpose(pairs).reshape(np.broadcast_shapes(c.shape[:-1], u.shape[:-1]))
 
 
-def _angles(u: Float[Array, "points 3"]) -> Float[Array, "4 points"]:
+def angles_of(u: Float[Array, "points 3"]) -> Float[Array, "4 points"]:
     """cos(theta), sin(theta), cos(phi), sin(phi). phi = 0 at the poles, where every y_l^m with m != 0 vanishes."""
     x, y, z = u.T
     rho = jnp.sqrt(x * x + y * y)
@@ -95,13 +95,13 @@ def _angles(u: Float[Array, "points 3"]) -> Float[Array, "4 points"]:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _basis(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]:
+def basis_at(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n"]:
     """The basis at unit vectors; off the sphere (in derivatives) the solid harmonics r^l y_l^m."""
     series, factors = (jnp.asarray(table, u.dtype) for table in _basis_tables(degree))
     # [2 (L+1), points], points in the vector lanes: cosines, then sines.
     theta, phi = (
         jnp.concatenate(angle_multiples(cos, sin, degree + 1))
-        for cos, sin in _angles(u.reshape(-1, 3)).reshape(2, 2, -1)
+        for cos, sin in angles_of(u.reshape(-1, 3)).reshape(2, 2, -1)
     )
     polar = theta.T @ series
     # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
@@ -118,7 +118,7 @@ def weighted_sums(values: Float[Array, "*p_f"], u: Float[Array, "p 3"], degree: 
     tile = 1024  # larger ones leave the cache
     fill = lambda a: jnp.pad(a, ((0, -a.shape[0] % tile), (0, 0))).reshape(-1, tile, a.shape[1])
     flat = values.reshape(values.shape[0], -1)
-    angles = _angles(jax.lax.stop_gradient(u)).T
+    angles = angles_of(jax.lax.stop_gradient(u)).T
 
     @jax.checkpoint
     def add(total: Array, some: tuple[Array, Array]) -> tuple[Array, None]:
@@ -134,10 +134,10 @@ def weighted_sums(values: Float[Array, "*p_f"], u: Float[Array, "p 3"], degree: 
     return jnp.sum(sums * jnp.asarray(series[None], u.dtype), axis=1).reshape(*values.shape[1:], -1)
 
 
-@_basis.defjvp
+@basis_at.defjvp
 def _basis_jvp(degree, primals, tangents):
     (u,), (du,) = primals, tangents
-    y = _basis(u, degree)
+    y = basis_at(u, degree)
     flat = y.reshape(-1, y.shape[-1])
     ones = jnp.ones((1, y.shape[-1]), y.dtype)  # a broadcast as a product: its transpose, a sum, is slow as a loop
     dy = jnp.zeros_like(flat)
@@ -165,7 +165,7 @@ def _expand(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) ->
     even, odd = _fourier(c, degree)
 
     def at(u: Float[Array, "points 3"]) -> Float[Array, "f points"]:
-        z, rho, *phi = _angles(u)
+        z, rho, *phi = angles_of(u)
         cos_phi, sin_phi = (a[None] for a in phi)
         cos, sin = angle_multiples(z, rho, degree + 1)
         waves = ((even @ cos, degree // 2 + 1), (odd @ sin, (degree + 1) // 2))
@@ -212,7 +212,7 @@ _expand.defjvp(_expand_jvp, symbolic_zeros=True)
 
 def _expand_by_basis(c: Float[Array, "f n"], u: Float[Array, "points 3"], degree: int) -> Float[Array, "f points"]:
     """The same values as products with the basis, which is made again in the backward pass rather than stored."""
-    return _in_tiles(jax.checkpoint(lambda u: c @ _basis(u, degree).T), u, _POINTS_AT_ONCE // 8)
+    return _in_tiles(jax.checkpoint(lambda u: c @ basis_at(u, degree).T), u, _POINTS_AT_ONCE // 8)
 
 
 def _fourier(c: Float[Array, "f n"], degree: int) -> tuple[Array, Array]:

@@ -42,7 +42,7 @@ def associated_legendre(theta: np.ndarray, degree: int) -> np.ndarray:
     return p
 
 
-def basis(directions: np.ndarray, degree: int) -> np.ndarray:
+def host_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """y_l^m at unit vectors [N, 3], as [N, (L+1)^2], float64 on the host."""
     x, y, z = directions.T
     m, l = orders(degree), bands(degree)

@@ -211,7 +211,7 @@ def analyse(values: Float[Array, "rows columns *f"], rule: Rows, degree: int) ->
     tables = (
         _azimuth_table(columns, degree, values.dtype, rule == "cells"),
         _row_table(rule, rows, degree, values.dtype, columns),
-        _series_table(degree, values.dtype),
+        series_table(degree, values.dtype),
     )
     return _analyse(values, *tables, degree)
 
@@ -222,7 +222,7 @@ def synthesize(c: Float[Array, "*f n"], rule: Rows, rows: int, columns: int) -> 
     tables = (
         _azimuth_table(columns, degree, c.dtype, False),
         _row_table(rule, rows, degree, c.dtype, None),
-        _series_table(degree, c.dtype),
+        series_table(degree, c.dtype),
     )
     return _synthesize(c, *tables, degree, rows, columns)
 
@@ -342,7 +342,7 @@ def _cosine_moment(n: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _series_table(degree: int, dtype: DTypeLike) -> np.ndarray:
+def series_table(degree: int, dtype: DTypeLike) -> np.ndarray:
     """`_tables.polar_series` in blocks of equal parities [p, q, h, i, k]."""
     n = degree // 2 + 1
     series = np.zeros((2 * n,) * 3)

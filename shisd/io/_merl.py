@@ -13,7 +13,7 @@ import numpy as np
 from shisd.io._files import StrPath, ordinary, refuse_existing, write_atomically
 
 if TYPE_CHECKING:
-    from shisd.models._brdf import AbstractBrdf
+    from shisd.models import AbstractBrdf
 
 MERL_BINS = (90, 90, 180)
 MERL_SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0

@@ -10,8 +10,9 @@ from shisd import _checks
 from shisd._module import Module
 from shisd._numerics import times
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.domains._region import cap_integrals
-from shisd.harmonics import _tables, product_matrix
+from shisd.domains.internal import cap_integrals
+from shisd.harmonics import product_matrix
+from shisd.harmonics.internal import zonal_norms
 
 
 class PolygonLight(Module):
@@ -119,7 +120,7 @@ class SphereLight(Module):
         d, degree = _checks.real_array("distance", distance), _checks.degree(degree)
         dtype = jnp.promote_types(d.dtype, self.radius.dtype)
         d, light = d.astype(dtype), jax.tree.map(lambda x: x.astype(dtype), self)
-        z = times(cap_integrals(versine(light, d * d), degree), jnp.asarray(_tables.zonal_norms(degree), dtype))
+        z = times(cap_integrals(versine(light, d * d), degree), jnp.asarray(zonal_norms(degree), dtype))
         return times(z.reshape(*d.shape, *(1,) * len(self.colour), degree + 1), light.emission[..., None])
 
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from shisd import _checks
 from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
-from shisd.harmonics import _tables, sh_basis
+from shisd.harmonics import sh_basis
+from shisd.harmonics.internal import bands, orders
 from shisd.models._brdf import AbstractBrdf, Colour, above_horizon
 
 
@@ -71,7 +72,7 @@ class ProjectedBrdf(AbstractBrdf):
         c = symmetric(self.coefficients)
         if not self.isotropic:
             return c
-        l, m = _tables.bands(self.degree), _tables.orders(self.degree)
+        l, m = bands(self.degree), orders(self.degree)
         same = jnp.asarray(m[:, None] == m[None, :])
         of_pairs = c[..., np.abs(m)[:, None], l[:, None], l[None]]
         return jnp.where(jnp.broadcast_to(same, of_pairs.shape), of_pairs, 0)
@@ -102,4 +103,4 @@ def to_orders(y: Float[Array, "*batch n"]) -> Float[Array, "*batch orders l"]:
 
 def from_orders(c: Float[Array, "*batch orders l"]) -> Float[Array, "*batch n"]:
     degree = c.shape[-1] - 1
-    return c[..., _tables.orders(degree) + degree, _tables.bands(degree)]
+    return c[..., orders(degree) + degree, bands(degree)]

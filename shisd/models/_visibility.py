@@ -31,10 +31,8 @@ from shisd._module import Module
 from shisd._progress import Progress, reporting
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.domains._region import cap_coefficients
-from shisd.harmonics import _tables
-from shisd.harmonics._rotation import rotate_many
-from shisd.harmonics._sh import weighted_sums
+from shisd.domains.internal import cap_coefficients
+from shisd.harmonics.internal import bands, orders, rotate_many, weighted_sums
 
 _RAYS_AT_ONCE = 1 << 20
 
@@ -334,7 +332,7 @@ def _project(
 @functools.partial(jax.jit, static_argnames="degree")
 def _of_hits(hits: Array, local: Float[Array, "r 3"], frames: Float[Array, "v 3 3"], degree: int) -> Array:
     hidden = weighted_sums(hits.T.astype(local.dtype) * (4 * np.pi / len(local)), local, degree)
-    even = (_tables.bands(degree) + _tables.orders(degree)) % 2 == 0
+    even = (bands(degree) + orders(degree)) % 2 == 0
     hidden = jnp.where(even[:, None], hidden.T, 0)  # n, V
     return (-rotate_many(hidden[:, None], frames, degree)[:, 0].T).at[:, 0].add(math.sqrt(4 * np.pi))
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd._typing import Array, Float
-from shisd.harmonics import _tables
+from shisd.harmonics.internal import bands
 from shisd.shading import _views
 from shisd.shading._lobes import RIDGE, Lobes, hemisphere_blocks
 from shisd.shading._matrix import BrdfMatrix, of_order
@@ -25,7 +25,7 @@ def band_energies(material: Lobes | BrdfMatrix) -> Float[Array, "*colour_views l
     c, degree = material.coefficients(), material.degree
     if material.domain == "upper":
         c = c @ jnp.asarray(_successive(degree), c.dtype)
-    member = _tables.bands(degree)[:, None] == np.arange(degree + 1)
+    member = bands(degree)[:, None] == np.arange(degree + 1)
     return jnp.square(c) @ jnp.asarray(member, c.dtype)
 
 

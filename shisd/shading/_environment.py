@@ -17,7 +17,7 @@ import numpy as np
 from shisd import _checks
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics._pairing import pair_many, turned_series
+from shisd.harmonics.internal import pair_many, turned_series
 from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import Surface, shade_points, shade_tiles, surface
 

@@ -17,9 +17,8 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from shisd._typing import Array, Float
-from shisd.domains._integrate import fold_expansion, incidence_inverse
-from shisd.domains._moments import Loop
-from shisd.harmonics import _tables
+from shisd.domains.internal import Loop, fold_expansion, incidence_inverse
+from shisd.harmonics.internal import orders
 from shisd.shading import _views
 
 _STEEP = 0.01  # s up to which the plane turns too fast
@@ -82,7 +81,7 @@ def _outline_moves(
 
 def _slices(table: Array, theta: Array, degree: int, *, over_sine: bool = False) -> Float[Array, "rows p"]:
     """Rows m >= 0 of the slices in the frame of the plane; `over_sine`, those with m > 0 over s, for m = 0 zeros."""
-    m = _tables.orders(degree)
+    m = orders(degree)
     rows = table[m >= 0] @ _views.spline_weights(theta, table.shape[1] - 4)
     scale = (0.0, 1.0) if over_sine else (1.0, jnp.sin(theta)[None])
     return rows * jnp.where(m[m >= 0][:, None] > 0, scale[1], scale[0])

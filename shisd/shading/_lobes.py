@@ -26,9 +26,7 @@ from shisd._numerics import safe_sqrt
 from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics import _tables
-from shisd.harmonics._pairing import rows
-from shisd.harmonics._sh import weighted_sums
+from shisd.harmonics.internal import associated_legendre, bands, orders, rows, weighted_sums
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 
@@ -97,7 +95,7 @@ def lookup_table(lobes: Lobes, degree: int | None = None) -> Float[Array, "*colo
     degree = lobes.degree if degree is None else degree
     c = lobes.coefficients()[..., : (degree + 1) ** 2]
     if lobes.isotropic:
-        return _views.spline_table(jnp.swapaxes(c, -1, -2), np.abs(_tables.orders(degree)))
+        return _views.spline_table(jnp.swapaxes(c, -1, -2), np.abs(orders(degree)))
     azimuths = c.shape[-2]
     k = np.arange(azimuths // 2 + 1)
     phases = np.outer(k, 2 * np.pi * np.arange(azimuths) / azimuths)
@@ -117,7 +115,7 @@ def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p
         return c
     # the table holds the slice of azimuth 0; turned by phi, m mixes with -m
     degree = _checks.degree_of(table.shape[-2])
-    m, l = _tables.orders(degree), _tables.bands(degree)
+    m, l = orders(degree), bands(degree)
     cos, sin = _views.azimuth_factors(view, degree + 1)
     sin = sin[np.abs(m)] * jnp.asarray(-np.sign(m)[:, None], c.dtype)
     cos, sin = (jnp.broadcast_to(f, c.shape) for f in (cos[np.abs(m)], sin))
@@ -367,7 +365,7 @@ def _hemisphere_modes(degree: int) -> tuple[np.ndarray, np.ndarray]:
 def hemisphere_blocks(degree: int) -> list[np.ndarray]:
     """For every order m, integrals above the horizon of products of y_l^m, rows and columns l = m ... degree."""
     z, weight = _unit_gauss(degree + 1)
-    p = _tables.associated_legendre(np.arccos(z), degree)  # a product of two of one order is a polynomial of z
+    p = associated_legendre(np.arccos(z), degree)  # a product of two of one order is a polynomial of z
     return [2 * np.pi * (p[m:, m] * weight) @ p[m:, m].T for m in range(degree + 1)]
 
 
@@ -380,7 +378,7 @@ def project_slice(
     values *= weight.reshape(-1, *(1,) * (values.ndim - 1))
     c = weighted_sums(values, w, degree)
     # seen from azimuth 0, the slice is even in y: half the nodes do, and sine components vanish
-    return jnp.where(_tables.orders(degree) >= 0, c, 0) if brdf.isotropic else c
+    return jnp.where(orders(degree) >= 0, c, 0) if brdf.isotropic else c
 
 
 def _nodes(

@@ -28,7 +28,8 @@ from shisd._numerics import angle_multiples, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics import _quadrature, _tables, sh_basis
+from shisd.harmonics import sh_basis
+from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 from shisd.shading._environment import shade_slices
@@ -83,7 +84,7 @@ class BrdfMatrix(Module):
         theta = _views.elevations(_checks.integer("views", views, 1))
         phi = 2 * np.pi * np.arange(_checks.integer("azimuths", azimuths, 1)) / azimuths
         grid = np.meshgrid(theta, phi[:1] if self.isotropic else phi, indexing="ij")
-        y = _tables.basis(_directions(*(a.ravel() for a in grid)), self.view_degree)
+        y = host_basis(_directions(*(a.ravel() for a in grid)), self.view_degree)
         c = jnp.einsum("...ij,vj->...vi", self.matrix(), jnp.asarray(y, self.blocks[0].dtype))
         return c if self.isotropic else c.reshape(*self.colour, *grid[0].shape, -1)
 
@@ -171,7 +172,7 @@ def _directions(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
 @functools.cache
 def _view_nodes(view_degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss nodes z in (0, 1) of the views that are projected, and solid angles of their rings."""
-    theta, weight = _quadrature.gauss_rows(view_degree + 32)
+    theta, weight = gauss_rows(view_degree + 32)
     return (1 + np.cos(theta)) / 2, np.pi * weight
 
 
@@ -183,7 +184,7 @@ def _view_fit(view_degree: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     modes that are small there stays small there, which it does not in one product with large numbers of both signs.
     """
     z, weight = _view_nodes(view_degree)
-    p = _tables.associated_legendre(np.arccos(z), view_degree)[m:, m] * (1 if m == 0 else np.sqrt(2))
+    p = associated_legendre(np.arccos(z), view_degree)[m:, m] * (1 if m == 0 else np.sqrt(2))
     u, s, v = np.linalg.svd((p * np.sqrt(weight)).T, full_matrices=False)
     return np.sqrt(weight)[:, None] * u, (s / (s * s + _VIEW_RIDGE))[:, None] * v
 
@@ -251,7 +252,7 @@ def _chebyshev_series(degree: int) -> np.ndarray:
     """Of y_l^m at azimuth 0 over 1, s or s^2, for m = 0, odd and even m: [m, l, k], polynomials of z."""
     theta = np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
     m = np.arange(degree + 1)[:, None, None]
-    p = np.swapaxes(_tables.associated_legendre(theta, degree), 0, 1) / np.sin(theta) ** np.where(m % 2, 1, 2 * (m > 0))
+    p = np.swapaxes(associated_legendre(theta, degree), 0, 1) / np.sin(theta) ** np.where(m % 2, 1, 2 * (m > 0))
     waves = np.cos(np.outer(theta, m)) * np.where(m.ravel() > 0, 2, 1) / (degree + 1)
     return p * np.where(m > 0, np.sqrt(2), 1) @ waves
 

@@ -22,8 +22,18 @@ from shisd._module import Module
 from shisd._numerics import angle_multiples, normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import _sh, _tables, _transform, project_map, sample_map, synthesize_map
-from shisd.harmonics._pairing import pair_many, rows, turned_series
+from shisd.harmonics import project_map, sample_map, synthesize_map
+from shisd.harmonics.internal import (
+    angles_of,
+    bands,
+    basis_at,
+    gradient_gather,
+    pair_many,
+    rows,
+    series_table,
+    turned_series,
+    zonal_norms,
+)
 from shisd.shading._footprint import MirrorFootprint
 from shisd.shading._surface import as_type, finite_mark, finite_or_nan, frame, in_tiles, masks, shade_points
 
@@ -88,7 +98,7 @@ def prefilter_mirror(texels: ArrayLike, *, levels: int = 13, degree: int | None 
     degree = min(len(texels) - 1, 255) if degree is None else _checks.degree(degree)
     variances = np.concatenate([[0], np.geomspace(min(3 / max(degree, 1), 0.5), 1, levels - 1) ** 2])
     e = project_map(texels, degree).reshape(-1, 1, (degree + 1) ** 2)
-    kept = jnp.asarray(np.exp(-np.outer(variances[1:], _half_eigenvalues(degree)))[:, _tables.bands(degree)], e.dtype)
+    kept = jnp.asarray(np.exp(-np.outer(variances[1:], _half_eigenvalues(degree)))[:, bands(degree)], e.dtype)
     filtered = synthesize_map(jnp.swapaxes(e * kept[None], 0, 1), len(texels))
     maps = jnp.concatenate([texels.reshape(*texels.shape[:2], 1, -1), filtered], axis=2)
     return MirrorMaps(maps, jnp.asarray(variances, maps.dtype), texels.shape[2:])
@@ -165,9 +175,9 @@ def _filtered(e: Float[Array, "f n"], u: Float[Array, "p 3"], k: Float[Array, "l
     """
     degree = len(k) - 1
     n = degree // 2 + 1
-    series, light = jnp.asarray(_transform._series_table(degree, np.dtype(u.dtype))), _by_parity(e, degree)
+    series, light = jnp.asarray(series_table(degree, np.dtype(u.dtype))), _by_parity(e, degree)
     k = jnp.pad(k, ((0, 2 * n - degree - 1), (0, 0)))
-    theta, phi = (angle_multiples(c, s, 2 * n) for c, s in _sh._angles(u).reshape(2, 2, -1))
+    theta, phi = (angle_multiples(c, s, 2 * n) for c, s in angles_of(u).reshape(2, 2, -1))
     total = jnp.zeros((e.shape[0], u.shape[0]), e.dtype)
     for p in range(2):  # of the degree
         for q in range(2):  # of the order
@@ -189,7 +199,7 @@ def _filtered_jvp(primals, tangents):
     if degree > 0 and not isinstance(du, SymbolicZero):
         gradients = [
             sum(jnp.asarray(factor[None], e.dtype) * e[:, index] for index, factor in terms)
-            for terms in _tables.gradient_gather(degree, transpose=True)
+            for terms in gradient_gather(degree, transpose=True)
         ]
         slopes = _filtered(jnp.concatenate(gradients), u, k[1:]).reshape(3, *values.shape)
         change += jnp.sum(slopes * du.T[:, None], axis=0)
@@ -201,7 +211,7 @@ _filtered.defjvp(_filtered_jvp, symbolic_zeros=True)
 
 def _filtered_by_basis(e: Float[Array, "f n"], u: Float[Array, "p 3"], k: Float[Array, "l p"]) -> Float[Array, "f p"]:
     degree = len(k) - 1
-    return e @ (_sh._basis(u, degree).T * k[_tables.bands(degree)])
+    return e @ (basis_at(u, degree).T * k[bands(degree)])
 
 
 def _by_parity(e: Float[Array, "f n"], degree: int) -> Float[Array, "2 2 h a i"]:
@@ -258,14 +268,14 @@ def _gaussian_tables(degree: int) -> tuple[np.ndarray, ...]:
     steps = np.maximum(1 - i * (i - 1) / np.maximum(2 * half[:, None], 1), 0)
     ladder = np.sqrt(np.cumprod(np.concatenate([np.ones((degree + 1, 1)), steps], axis=1), axis=1))[:, even]
     ladder[0, 1:] = 0
-    factor = ladder * _tables.zonal_norms(degree)[:, None] / count
+    factor = ladder * zonal_norms(degree)[:, None] / count
     factor *= (-1.0) ** (even // 2) * np.where(even > 0, np.sqrt(2), 1)
     waves = np.stack([np.cos(np.outer(even, angle)), np.sin(np.outer(even, angle))])
     to_orders = (factor[:, None, :, None] * waves[None]).reshape(degree + 1, -1, count)
     plus, minus, k = rows(degree)
 
     def places(index: np.ndarray, first: int) -> np.ndarray:
-        l = np.append(_tables.bands(degree), 0)[index]
+        l = np.append(bands(degree), 0)[index]
         there = (index < (degree + 1) ** 2) & (k % 2 == 0)
         return np.where(there, l * 2 * len(even) + first + k // 2, to_orders.shape[0] * to_orders.shape[1])
 

@@ -23,14 +23,19 @@ from shisd._numerics import dot, normalize, times
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.domains import HaarBasis
-from shisd.domains._haar import clip_to_cells
-from shisd.domains._integrate import fold_expansion, loop_coefficients, zonal_inverse
-from shisd.domains._moments import Loop
-from shisd.domains._polygon import clip, loop_solid_angle, on_sphere
-from shisd.harmonics import _tables
-from shisd.harmonics._rotation import rotate_many
+from shisd.domains.internal import (
+    Loop,
+    clip,
+    clip_to_cells,
+    fold_expansion,
+    loop_coefficients,
+    loop_solid_angle,
+    on_sphere,
+    zonal_inverse,
+)
+from shisd.harmonics.internal import bands, rotate_many
 from shisd.models import PolygonLight, PortalLight
-from shisd.models._light import product_matrices
+from shisd.models.internal import product_matrices
 from shisd.shading._incidence import incidence_integrals
 from shisd.shading._lobes import Lobes, check_lobes, lookup_factors, lookup_table, slice_values
 from shisd.shading._surface import (
@@ -281,7 +286,7 @@ def incident_radiance(light: Light) -> Float[Array, "*colour_n"]:
         return light.coefficients
     if light.profile is None:
         return light.emission[..., None] / _Y_00
-    parity = (-1.0) ** _tables.bands(_checks.degree_of(light.profile.shape[-1]))
+    parity = (-1.0) ** bands(_checks.degree_of(light.profile.shape[-1]))
     return times(times(light.profile, jnp.asarray(parity, light.profile.dtype)), light.emission[..., None])
 
 

@@ -31,7 +31,7 @@ from shisd._module import Module
 from shisd._numerics import arctan2, normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.harmonics import _tables
+from shisd.harmonics.internal import bands, quarter_mirror, swap_matrices
 from shisd.shading import _views
 from shisd.shading._lobes import Lobes, check_lobes
 from shisd.shading._surface import as_type, finite_mark, finite_or_nan, in_tiles, masks, shade_points
@@ -147,8 +147,8 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
     """The centre that needs fewer maps to meet the tolerance, and its channels; no tables yet."""
     degree = _checks.degree_of(c.shape[-1])
     e = e.reshape(-1, e.shape[-1])
-    bands = np.arange(degree + 1)
-    energy = np.add.reduceat(e * e, bands**2, axis=1) / (2 * bands + 1)
+    l = np.arange(degree + 1)
+    energy = np.add.reduceat(e * e, l**2, axis=1) / (2 * l + 1)
     swaps, slices = jnp.asarray(_swaps(degree), float), jnp.asarray(c, float)
     found = []
     for mirror in (False, True):
@@ -228,7 +228,7 @@ def _swaps(degree: int) -> np.ndarray:
     """J_l of all bands [l, m, k], zero where |m| or |k| > l."""
     inner = [slice(degree - l, degree + l + 1) for l in range(degree + 1)]
     swaps = np.zeros((degree + 1, 2 * degree + 1, 2 * degree + 1))
-    for l, j in enumerate(_tables.swap_matrices(degree)):
+    for l, j in enumerate(swap_matrices(degree)):
         swaps[l, inner[l], inner[l]] = j
     return swaps
 
@@ -273,8 +273,8 @@ def _error(
     member = jnp.asarray(like.order[:, None] == orders[None], c.dtype)
     made = jnp.einsum("am,al,sav->lmsv", member, like.expand, a)
     largest = jnp.maximum(jnp.max(jnp.abs(e)), jnp.finfo(e.dtype).tiny)
-    bands = np.equal.outer(_tables.bands(degree), np.arange(degree + 1)) / (2 * np.arange(degree + 1) + 1)
-    energy = (e / largest) ** 2 @ jnp.asarray(bands, e.dtype)
+    means = np.equal.outer(bands(degree), np.arange(degree + 1)) / (2 * np.arange(degree + 1) + 1)
+    energy = (e / largest) ** 2 @ jnp.asarray(means, e.dtype)
     shares = jnp.asarray(_shares(c.shape[-1]), c.dtype)
     slices = lambda x: jnp.einsum("lmsv,v->sl", x * x, shares)
     radiance = lambda x: jnp.sum(jnp.broadcast_to(slices(x), shape) * jnp.broadcast_to(energy, shape), axis=1)
@@ -286,7 +286,7 @@ def _error(
 
 def _about_x(e: Float[Array, "s l m"], swaps: Float[Array, "l m m"]) -> Float[Array, "s l m"]:
     """Light in the chart whose pole is x and whose axes are (y, z, x): x and y exchanged, then y and z."""
-    mirror = jnp.asarray(_tables.quarter_mirror(len(swaps) - 1), e.dtype)  # of the highest band: it holds all others
+    mirror = jnp.asarray(quarter_mirror(len(swaps) - 1), e.dtype)  # of the highest band: it holds all others
     return jnp.einsum("lkm,slm->slk", swaps, e @ mirror)
 
 

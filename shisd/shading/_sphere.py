@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from shisd._numerics import times
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.domains._region import cap_coefficients
+from shisd.domains.internal import cap_coefficients
 from shisd.models import SphereLight
-from shisd.models._light import versine
+from shisd.models.internal import versine
 from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
 from shisd.shading._surface import as_type, local_lights, shade_points, shade_tiles, stacked, sum_lights, surface
 

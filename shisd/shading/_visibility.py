@@ -21,10 +21,9 @@ from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import multiply
-from shisd.harmonics._pairing import Each, pair_many, rows
+from shisd.harmonics.internal import Each, pair_many, rows
 from shisd.models import Visibility
-from shisd.models._light import product_matrices
-from shisd.models._visibility import surface_corners
+from shisd.models.internal import product_matrices, surface_corners
 from shisd.shading._environment import shade_environment
 from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import shade_points, shade_tiles, surface

@@ -8,13 +8,13 @@ notation: a = axis; z_l = coefficients of the zonal light; pi_l = sqrt(4 pi/(2l+
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 
 from shisd import _checks
 from shisd._numerics import normalize, times
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import _tables, sh_basis
+from shisd.harmonics import sh_basis
+from shisd.harmonics.internal import bands, zonal_norms
 from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
 from shisd.shading._surface import shade_points, shade_tiles, sum_lights, surface
 
@@ -69,8 +69,8 @@ def _shade(
     colour: tuple[int, ...],
 ) -> Float[Array, " p *colour"]:
     degree = z.shape[-1] - 1
-    bands = _tables.bands(degree)
-    z = (z / jnp.broadcast_to(jnp.asarray(_tables.zonal_norms(degree), z.dtype), z.shape))[..., np.asarray(bands)]
+    l = bands(degree)
+    z = (z / jnp.broadcast_to(jnp.asarray(zonal_norms(degree), z.dtype), z.shape))[..., l]
 
     table = lookup_table(lobes, degree)
 

@@ -70,7 +70,7 @@ def line_coefficients(v: jax.Array, degree: int) -> jax.Array:
     a, b = jnp.concatenate([v, middle], axis=1), jnp.concatenate([middle, end], axis=1)
     p = a[:, :, None] + ((x + 1) / 2)[None, None, :, None] * (b - a)[:, :, None]
     length2 = jnp.sum(p * p, axis=0)
-    y = _sh._basis(jnp.moveaxis(p / jnp.sqrt(length2)[None], 0, -1).reshape(-1, 3), degree - 1)
+    y = _sh.basis_at(jnp.moveaxis(p / jnp.sqrt(length2)[None], 0, -1).reshape(-1, 3), degree - 1)
     weight = (w / 2)[None, :, None] / length2
     lines = jnp.einsum("sqpn,sqp,isp->ipn", y.reshape(*length2.shape, -1), weight, jnp.cross(a, b - a, axis=0))
     lines = jnp.pad(lines, ((0, 0), (0, 0), (0, 2 * degree + 1)))

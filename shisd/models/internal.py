@@ -1,0 +1,7 @@
+"""What later stages take from inside models: formulas of lights, points of meshes, repairs of measured tables."""
+
+from shisd.models._light import product_matrices as product_matrices
+from shisd.models._light import versine as versine
+from shisd.models._measured import fill_nearest as fill_nearest
+from shisd.models._projected import symmetric as symmetric
+from shisd.models._visibility import surface_corners as surface_corners
