@@ -210,7 +210,7 @@ def test_what_a_module_may_import(place, source):
 
 def test_truth_imports_nothing_that_it_judges():
     paths = sorted((PACKAGE.parent / "tests" / "truth").rglob("*.py"))
-    names = [(path.name, name) for path in paths for name in imported(ast.parse(path.read_text()))]
+    names = [(path.name, name) for path in paths for _, name in imported(ast.parse(path.read_text()))]
     others = [x for x in names if x[1].split(".")[0] in ("", "shisd", "tests") and not x[1].startswith("tests.truth.")]
     assert names and others == []
 
