@@ -28,13 +28,12 @@ from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, Float
-from shisd.decomposition import RotatedZonalBasis, optimized_directions
 from shisd.decomposition.internal import TABLE_DEGREE
 from shisd.harmonics import convolve, evaluate, multiply, sphere_rule
 from shisd.harmonics.internal import host_basis, zonal_norms
 from shisd.models import AbstractBrdf, Environment, PolygonLight, PortalLight
 from shisd.shading import (
-    Lobes,
+    Slices,
     project_light,
     shade_environment,
     shade_polygon,
@@ -222,7 +221,7 @@ class Zonal(Path):
 
     name = "zonal light"
     takes = Environment
-    lobes: Lobes
+    slices: Slices
     axis: Float[Array, "3"]
     coefficients: Float[Array, "*colour l"]
 
@@ -240,10 +239,10 @@ class Zonal(Path):
     def make(cls, material, tables, lights, degree):
         (light,) = lights
         z = jnp.asarray(light.zonal[:, : degree + 1], float)
-        return cls(tables.lobes(degree), jnp.asarray(light.axis, float), z if light.coloured else z[0])
+        return cls(tables.slices(degree), jnp.asarray(light.axis, float), z if light.coloured else z[0])
 
     def shade(self, positions, normals, views, tangents):
-        return shade_zonal(self.lobes, self.axis, self.coefficients, normals, views, tangents)
+        return shade_zonal(self.slices, self.axis, self.coefficients, normals, views, tangents)
 
 
 class Table(Path):
@@ -251,7 +250,7 @@ class Table(Path):
 
     name = "table"
     takes = Environment
-    lobes: Lobes
+    slices: Slices
     coefficients: Float[Array, "*colour n"]
 
     @staticmethod
@@ -267,10 +266,10 @@ class Table(Path):
 
     @classmethod
     def make(cls, material, tables, lights, degree):
-        return cls(tables.lobes(degree), _sum(lights, degree))
+        return cls(tables.slices(degree), _sum(lights, degree))
 
     def shade(self, positions, normals, views, tangents):
-        return shade_environment(self.lobes, self.coefficients, normals, views, tangents)
+        return shade_environment(self.slices, self.coefficients, normals, views, tangents)
 
 
 class Polygon(Path):
@@ -278,7 +277,7 @@ class Polygon(Path):
 
     name = "polygon"
     takes = PolygonLight
-    lobes: Lobes
+    slices: Slices
     light: PolygonLight
 
     @staticmethod
@@ -296,10 +295,10 @@ class Polygon(Path):
 
     @classmethod
     def make(cls, material, tables, lights, degree):
-        return cls(tables.lobes(degree, above=True), lights[0].light)
+        return cls(tables.slices(degree, above=True), lights[0].light)
 
     def shade(self, positions, normals, views, tangents):
-        return shade_polygon(self.lobes, self.light, positions, normals, views, tangents)
+        return shade_polygon(self.slices, self.light, positions, normals, views, tangents)
 
 
 class Portal(Path):
@@ -307,7 +306,7 @@ class Portal(Path):
 
     name = "portal"
     takes = PortalLight
-    lobes: Lobes
+    slices: Slices
     light: PortalLight
 
     @staticmethod
@@ -321,10 +320,10 @@ class Portal(Path):
     @classmethod
     def make(cls, material, tables, lights, degree):
         portal = lights[0].light
-        return cls(tables.lobes(degree, above=True), portal)
+        return cls(tables.slices(degree, above=True), portal)
 
     def shade(self, positions, normals, views, tangents):
-        return shade_portal(self.lobes, self.light, positions, normals, views, tangents)
+        return shade_portal(self.slices, self.light, positions, normals, views, tangents)
 
 
 PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal)
@@ -661,38 +660,23 @@ def _bands_squared(degree: int) -> float:
 
 
 class _Tables:
-    """Lobes of a material, tabulated once to some degree; those of lower degrees are cut from them, on the host."""
+    """Slices of a material, tabulated once to some degree; those of lower degrees are cut from them."""
 
     def __init__(self, brdf: AbstractBrdf, degree: int, views: int):
-        self._all = tabulate_brdf(brdf, RotatedZonalBasis(optimized_directions(degree), degree), views=views)
-        weights = np.asarray(self._all.weights, float)
-        self._coefficients = np.concatenate(
-            [weights[..., l, :] @ m.T for l, m in enumerate(_band_matrices(degree))], axis=-1
-        )
-        self._made: dict[tuple[int, bool], Lobes] = {}
+        self._all = tabulate_brdf(brdf, degree, views=views)
+        self._made: dict[tuple[int, bool], Slices] = {}
 
-    def lobes(self, degree: int, above: bool = False) -> Lobes:
+    def slices(self, degree: int, above: bool = False) -> Slices:
         if (degree, above) not in self._made:
             self._made[degree, above] = self._cut(degree, above)
         return self._made[degree, above]
 
-    def _cut(self, degree: int, above: bool) -> Lobes:
-        c = self._coefficients[..., : (degree + 1) ** 2]
-        if above:
-            c = np.asarray(fit_above(jnp.asarray(c, float), RIDGE), float)
-        bands = np.split(c, np.arange(1, degree + 1) ** 2, axis=-1)
-        weights = [b @ np.linalg.pinv(m).T for b, m in zip(bands, _band_matrices(degree), strict=True)]
-        basis = RotatedZonalBasis(optimized_directions(degree), degree)
+    def _cut(self, degree: int, above: bool) -> Slices:
         every, domain = self._all, "upper" if above else "sphere"
-        table = jnp.asarray(np.stack(weights, axis=-2), float)
-        return Lobes(basis, table, every.quadrature_error, every.isotropic, domain)
-
-
-def _band_matrices(degree: int) -> list[np.ndarray]:
-    """M_l of the optimised axes (ISD15 Eq. 10), for every band."""
-    y = host_basis(np.asarray(optimized_directions(degree), float), degree)
-    norms = zonal_norms(degree)
-    return [y[:, l * l : (l + 1) ** 2].T / norms[l] for l in range(degree + 1)]
+        c = every.coefficients[..., : (degree + 1) ** 2]
+        if above:
+            c = fit_above(c, RIDGE)
+        return Slices(c, quadrature_error=every.quadrature_error, isotropic=every.isotropic, domain=domain)
 
 
 def _sum(lights: list[_Distant], degree: int) -> Float[Array, "*colour n"]:

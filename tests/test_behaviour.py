@@ -129,7 +129,7 @@ rotated = lambda: decomposition.ZonalLobes(W[:2], normal(3, 3, 2))
 
 
 def lobes(domain="sphere"):
-    return shading.Lobes(basis(), jnp.asarray(normal(3, 4, 3, 5)), jnp.zeros((), np.float32), True, domain)
+    return shading.Slices(normal(3, 4, 9), domain=domain)
 
 
 @functools.cache
@@ -388,18 +388,20 @@ CASES = [
         idle=("noise",),
     ),
     Case("models.cap_visibility", lambda a, t: models.cap_visibility(a, t, 2), lambda: (W, np.abs(W[:, 0])), (0, 1)),
-    Case("shading.Lobes.coefficients", lambda l: l.coefficients(), lambda: (lobes(),), idle=("quadrature_error",)),
     Case(
-        "shading.Lobes.slice_coefficients",
-        lambda l, v: l.slice_coefficients(v),
-        lambda: (lobes(), WO),
-        (1,),
-        False,
+        "shading.Slices.weights",
+        lambda s, b: s.weights(b),
+        lambda: (lobes(), basis()),
         idle=("quadrature_error",),
     ),
     Case(
-        "shading.Lobes.slice_weights",
-        lambda l, v: l.slice_weights(v),
+        "shading.Slices.from_weights",
+        lambda b, w: shading.Slices.from_weights(b, w),
+        lambda: (basis(), normal(3, 4, 3, 5)),
+    ),
+    Case(
+        "shading.Slices.at",
+        lambda s, v: s.at(v),
         lambda: (lobes(), WO),
         (1,),
         False,
@@ -407,20 +409,14 @@ CASES = [
     ),
     Case("shading.BrdfMatrix.matrix", lambda m: m.matrix(), lambda: (blocks(),), idle=("quadrature_error",)),
     Case(
-        "shading.BrdfMatrix.slice_coefficients",
-        lambda m, v: m.slice_coefficients(v),
+        "shading.BrdfMatrix.at",
+        lambda m, v: m.at(v),
         lambda: (blocks(), WO),
         (1,),
         False,
         idle=("quadrature_error",),
     ),
-    Case(
-        "shading.BrdfMatrix.coefficients",
-        lambda m: m.coefficients(4, 4),
-        lambda: (blocks(),),
-        idle=("quadrature_error",),
-    ),
-    Case("shading.BrdfMatrix.lobes", lambda m, b: m.lobes(b, views=4), lambda: (blocks(), basis()), heavy=True),
+    Case("shading.BrdfMatrix.slices", lambda m: m.slices(views=4).coefficients, lambda: (blocks(),)),
     Case(
         "shading.MirrorFootprint.from_derivatives",
         shading.MirrorFootprint.from_derivatives,
@@ -435,8 +431,8 @@ CASES = [
     Case("shading.band_energies", shading.band_energies, lambda: (lobes(),), idle=("quadrature_error",)),
     Case(
         "shading.tabulate_brdf",
-        lambda f, b: shading.tabulate_brdf(f, b, views=4, quadrature=48, throw=False),
-        lambda: (BRDFS["Phong"](), basis()),
+        lambda f: shading.tabulate_brdf(f, 2, views=4, quadrature=48, throw=False),
+        lambda: (BRDFS["Phong"](),),
         heavy=True,
     ),
     Case(

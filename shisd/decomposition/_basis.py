@@ -77,7 +77,11 @@ class RotatedZonalBasis(Module):
         Arguments: `weights` [..., L+1, K]. Returns [..., (L+1)^2]. A nested basis ignores the weights of axes that a
         band does not use, in `evaluate` too.
         """
-        return self._expand(weights, unit_axes(self.directions))
+        weights = check_weights(weights, self.degree, self.size, self.nested)
+        weights, m = same_dtype(weights, self._matrices())
+        c = jnp.einsum("lmk,...lk->...lm", m, weights, precision="highest")
+        _, mask = padding(self.degree)
+        return c[..., mask]
 
     @method
     def evaluate(self, weights: ArrayLike, directions: ArrayLike) -> Float[Array, "*batch"]:
@@ -110,23 +114,10 @@ class RotatedZonalBasis(Module):
         """
         return _condition_numbers(self)
 
-    def unchecked_coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
-        """`coefficients` without the refusal of bad axes, which would keep JAX from storing the compiled code."""
-        return self._expand(weights, normalize(self.directions))
-
-    def _expand(self, weights: ArrayLike, axes: Float[Array, "K 3"]) -> Float[Array, "*batch n"]:
-        weights = check_weights(weights, self.degree, self.size, self.nested)
-        weights, m = same_dtype(weights, self._matrices(axes))
-        c = jnp.einsum("lmk,...lk->...lm", m, weights, precision="highest")
-        _, mask = padding(self.degree)
-        return c[..., mask]
-
-    def _matrices(
-        self, axes: Float[Array, "K 3"] | None = None
-    ) -> Float[Array, "{self.degree}+1 2*{self.degree}+1 {self.size}"]:
+    def _matrices(self) -> Float[Array, "{self.degree}+1 2*{self.degree}+1 {self.size}"]:
         """M_l of all bands, stacked; zero in rows beyond the 2l+1 of a band and in columns of axes it does not use."""
         index, mask = padding(self.degree)
-        y = jnp.swapaxes(sh_basis(unit_axes(self.directions) if axes is None else axes, self.degree), 0, 1)
+        y = jnp.swapaxes(sh_basis(unit_axes(self.directions), self.degree), 0, 1)
         m = jnp.where(mask.T[:, :, None], y[index.T], 0) * jnp.asarray(_pi(self.degree), dtype=y.dtype)[None, :, None]
         return jnp.swapaxes(used_only(m, self.nested), 0, 1)
 

@@ -30,9 +30,7 @@ def ordinary(path: StrPath) -> Path:
     return path
 
 
-def write_atomically(
-    path: StrPath, content: str | Callable[[IO[bytes]], object], *, overwrite: bool = False
-) -> None:
+def write_atomically(path: StrPath, content: str | Callable[[IO[bytes]], object], *, overwrite: bool = False) -> None:
     """Write a file that is there completely or not at all.
 
     `content` is the text, or a function that gets a binary file to write to: a new one beside `path`, which takes its

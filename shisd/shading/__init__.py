@@ -1,4 +1,4 @@
-"""Stage 5: radiance, from materials as lobes and light as coefficients.
+"""Stage 5: radiance, from materials as slices and light as coefficients.
 
 Directions are in world space and point away from the surface; image colour is the last axis.
 """
@@ -8,8 +8,6 @@ from shisd.shading._degree import material_degree as material_degree
 from shisd.shading._environment import shade_environment as shade_environment
 from shisd.shading._footprint import MirrorFootprint as MirrorFootprint
 from shisd.shading._footprint import mirror_footprint as mirror_footprint
-from shisd.shading._lobes import Lobes as Lobes
-from shisd.shading._lobes import tabulate_brdf as tabulate_brdf
 from shisd.shading._matrix import BrdfMatrix as BrdfMatrix
 from shisd.shading._matrix import project_brdf as project_brdf
 from shisd.shading._matrix import shade_matrix as shade_matrix
@@ -27,3 +25,5 @@ from shisd.shading._sphere import shade_sphere as shade_sphere
 from shisd.shading._visibility import shade_environment_visibility as shade_environment_visibility
 from shisd.shading._visibility import visibility_gamma as visibility_gamma
 from shisd.shading._zonal import shade_zonal as shade_zonal
+from shisd.shading.slices._slices import Slices as Slices
+from shisd.shading.slices._tabulate import tabulate_brdf as tabulate_brdf

@@ -9,27 +9,29 @@ import numpy as np
 from shisd._typing import Array, Float
 from shisd.harmonics.internal import bands
 from shisd.shading import _views
-from shisd.shading._lobes import RIDGE, Lobes, hemisphere_blocks
 from shisd.shading._matrix import BrdfMatrix, of_order
+from shisd.shading.slices._slices import Slices
+from shisd.shading.slices._upper import RIDGE, hemisphere_blocks
 
 
-def band_energies(material: Lobes | BrdfMatrix) -> Float[Array, "*colour_views l"]:
+def band_energies(material: Slices | BrdfMatrix) -> Float[Array, "*colour_views l"]:
     """Energies of the bands of a material's slices, the squared norm that each adds to the lower ones.
 
     Returns [*colour, V, L+1] for isotropic materials, [*colour, V, A, L+1] for anisotropic ones, in 1/sr: for the views
-    of `material.coefficients()`. Where the slices were fitted above the horizon, norms are those above it, of the best
-    fit of each degree there.
+    of the slices, or of a matrix's `slices()`. Where they were fitted above the horizon, norms are those above it, of
+    the best fit of each degree there.
     Derivatives: in the material.
     """
     _check_material(material)
-    c, degree = material.coefficients(), material.degree
+    slices, degree = material if isinstance(material, Slices) else material.slices(), material.degree
+    c = slices.coefficients
     if material.domain == "upper":
         c = c @ jnp.asarray(_successive(degree), c.dtype)
     member = bands(degree)[:, None] == np.arange(degree + 1)
     return jnp.square(c) @ jnp.asarray(member, c.dtype)
 
 
-def material_degree(material: Lobes | BrdfMatrix, tolerance: float, *, worst: bool = False) -> int:
+def material_degree(material: Slices | BrdfMatrix, tolerance: float, *, worst: bool = False) -> int:
     """The smallest degree whose slices differ from those given by at most `tolerance`, relative to their RMS.
 
     Arguments: `material`; static `tolerance`; the RMS is over the views of a sphere's picture, by colour, of which the
@@ -63,7 +65,7 @@ def material_degree(material: Lobes | BrdfMatrix, tolerance: float, *, worst: bo
 
 
 def _check_material(material: object) -> None:
-    if not isinstance(material, Lobes | BrdfMatrix):
+    if not isinstance(material, Slices | BrdfMatrix):
         name = type(material).__name__
         raise ValueError(f"`material` must come from shading.tabulate_brdf or shading.project_brdf; got {name}.")
 

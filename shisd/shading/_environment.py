@@ -18,15 +18,15 @@ from shisd import _checks
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics.internal import pair_many, turned_series
-from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import Surface, shade_points, shade_tiles, surface
+from shisd.shading.slices._slices import Slices, check_slices, slice_orders
 
 _NUMBERS_AT_ONCE = 3 << 18  # coefficients of slices in a tile: small ones keep one core busy, large ones leave caches
 _LARGEST_TILE = 4096
 
 
 def shade_environment(
-    lobes: Lobes,
+    material: Slices,
     light_coefficients: ArrayLike,
     normals: ArrayLike,
     views: ArrayLike,
@@ -36,11 +36,11 @@ def shade_environment(
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under distant light (ISD15 Eq. 22).
 
-    Arguments: `lobes` from `tabulate_brdf`; `light_coefficients` [*colour, n], SH coefficients of the incident
+    Arguments: `material` from `tabulate_brdf`; `light_coefficients` [*colour, n], SH coefficients of the incident
     radiance in world space; `normals` and `views` [..., 3] in world space, of any length, pointing away from the
     surface; `tangents` [..., 3], the local x axis of anisotropic materials (needed for these, ignored for others; only
     its part along the surface counts); `mask` [...], bool: where it is False, radiance is 0 with gradient 0, whatever
-    the other arrays hold there, as pixels of the background do. Colours of lobes and light broadcast: scalar or RGB.
+    the other arrays hold there, as pixels of the background do. Colours of material and light broadcast: scalar or RGB.
     Bands that only one of the two has add nothing. Returns [..., *colour] in W/(m2 sr), or the light's unit. A view
     that is not above the horizon gives 0. A NaN anywhere, a zero normal or view, and a tangent along the normal give
     NaN, with NaN gradients.
@@ -53,20 +53,21 @@ def shade_environment(
     pixels, about 3 MB per array, and the result; the same with gradients.
     Source: ISD15 Eq. 20-22.
     """
-    check_lobes(lobes, everywhere=True)
+    check_slices(material, everywhere=True)
     e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
     light = [("light_coefficients", e.shape[:-1])]
-    lobes, points, colour = surface("lobes", lobes, tangents, light, [e.dtype], mask, normals=normals, views=views)
-    degree = min(light_degree, lobes.degree)
-    e = e[..., : (degree + 1) ** 2].astype(lobes.weights.dtype)
-    return by_device(shade_points, points, _shade, lobes, e, colour)
+    vectors = {"normals": normals, "views": views}
+    material, points, colour = surface("material", material, tangents, light, [e.dtype], mask, **vectors)
+    degree = min(light_degree, material.degree)
+    e = e[..., : (degree + 1) ** 2].astype(material.coefficients.dtype)
+    return by_device(shade_points, points, _shade, material, e, colour)
 
 
 @eqx.filter_jit
 def _shade(
-    points: dict[str, Float[Array, "p 3"]], lobes: Lobes, e: Float[Array, "*c n"], colour: tuple[int, ...]
+    points: dict[str, Float[Array, "p 3"]], material: Slices, e: Float[Array, "*c n"], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    return shade_slices(points, lobes, slice_orders(lobes, _checks.degree_of(e.shape[-1])), e, colour)
+    return shade_slices(points, material, slice_orders(material, _checks.degree_of(e.shape[-1])), e, colour)
 
 
 def shade_slices(

@@ -27,14 +27,15 @@ from shisd._module import Module
 from shisd._numerics import angle_multiples, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics import sh_basis
 from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 from shisd.shading._environment import shade_slices
-from shisd.shading._lobes import RIDGE, Lobes, by_convergence, products_in_order, slices_at
 from shisd.shading._surface import shade_points, surface
+from shisd.shading.slices._slices import Slices, check_domain, products_in_order
+from shisd.shading.slices._tabulate import by_convergence, slices_at
+from shisd.shading.slices._upper import RIDGE
 
 _VIEW_RIDGE = 1e-10  # of fits over views
 
@@ -44,7 +45,7 @@ class BrdfMatrix(Module):
 
     blocks: for isotropic materials, the block [*colour, L+1-m, Lv+1-m] of every order m up to the lesser of L and Lv,
     rows l = m ... L and columns l' = m ... Lv; for anisotropic ones the whole F [*colour, (L+1)^2, (Lv+1)^2] alone.
-    `quadrature_error` and `domain` as in `Lobes`. F means something for views above the horizon only.
+    `quadrature_error` and `domain` as in `Slices`. F means something for views above the horizon only.
     """
 
     blocks: tuple[Float[Array, "*colour _ _"], ...]
@@ -70,7 +71,7 @@ class BrdfMatrix(Module):
         return full
 
     @method
-    def slice_coefficients(self, view: Float[Array, "3"]) -> Float[Array, "*colour n"]:
+    def at(self, view: Float[Array, "3"]) -> Float[Array, "*colour n"]:
         """SH coefficients, in the local frame, of the slice seen from the local direction `view` [3], F y(view).
 
         Derivatives: in the view and the matrix, both modes, any order, also at the normal.
@@ -79,22 +80,16 @@ class BrdfMatrix(Module):
         return jnp.einsum("...ij,j->...i", self.matrix(), sh_basis(view, self.view_degree))
 
     @method
-    def coefficients(self, views: int = 64, azimuths: int = 64) -> Float[Array, "*colour_views n"]:
-        """SH coefficients of slices at the views of a table, as `Lobes.coefficients` has them."""
-        theta = _views.elevations(_checks.integer("views", views, 1))
+    def slices(self, *, views: int = 64, azimuths: int | None = None) -> Slices:
+        """These slices as a table of `views` elevations and, of anisotropic materials, `azimuths` (None: enough)."""
+        theta = _views.elevations(_checks.integer("views", views, 4))
+        azimuths = _azimuths(self.degree, self.view_degree) if azimuths is None else azimuths
         phi = 2 * np.pi * np.arange(_checks.integer("azimuths", azimuths, 1)) / azimuths
         grid = np.meshgrid(theta, phi[:1] if self.isotropic else phi, indexing="ij")
         y = host_basis(_directions(*(a.ravel() for a in grid)), self.view_degree)
         c = jnp.einsum("...ij,vj->...vi", self.matrix(), jnp.asarray(y, self.blocks[0].dtype))
-        return c if self.isotropic else c.reshape(*self.colour, *grid[0].shape, -1)
-
-    @method
-    def lobes(self, basis: RotatedZonalBasis, *, views: int = 64) -> Lobes:
-        """These slices as a table, for the verbs that take lobes; `basis` of the same degree."""
-        if not isinstance(basis, RotatedZonalBasis) or basis.degree != self.degree:
-            raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis of degree {self.degree}.")
-        c = self.coefficients(_checks.integer("views", views, 4), _azimuths(self.degree, self.view_degree))
-        return Lobes(basis, basis.weights(c), self.quadrature_error, self.isotropic, self.domain)
+        c = c if self.isotropic else c.reshape(*self.colour, *grid[0].shape, -1)
+        return Slices(c, quadrature_error=self.quadrature_error, isotropic=self.isotropic, domain=self.domain)
 
 
 def project_brdf(
@@ -122,8 +117,7 @@ def project_brdf(
         raise ValueError(f"`brdf` must be a models.AbstractBrdf; got {type(brdf).__name__}.")
     degree = _checks.degree(degree)
     view_degree = degree + 8 if view_degree is None else _checks.integer("view_degree", view_degree)
-    if domain not in ("sphere", "upper"):
-        raise ValueError(f"`domain` must be 'sphere' or 'upper'; got {domain!r}.")
+    check_domain(domain)
     tolerance, ridge = _checks.number("tolerance", tolerance, positive=True), RIDGE if domain == "upper" else None
     dtype = jnp.result_type(brdf.lobe_width)
     made = lambda nodes: _project(brdf, degree, view_degree, dtype, nodes, ridge)

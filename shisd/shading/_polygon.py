@@ -37,7 +37,6 @@ from shisd.harmonics.internal import bands, rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models.internal import product_matrices
 from shisd.shading._incidence import incidence_integrals
-from shisd.shading._lobes import Lobes, check_lobes, lookup_factors, lookup_table, slice_values
 from shisd.shading._surface import (
     as_type,
     finite_mark,
@@ -51,6 +50,7 @@ from shisd.shading._surface import (
     sum_lights,
     surface,
 )
+from shisd.shading.slices._slices import Slices, check_slices, lookup_factors, lookup_table, slice_values
 
 Light = PolygonLight | PortalLight
 _TILE = 2048  # pixels at a time
@@ -59,7 +59,7 @@ _Y_00 = math.sqrt(1 / (4 * math.pi))
 
 
 def shade_polygon(
-    lobes: Lobes,
+    material: Slices,
     light: PolygonLight | Sequence[PolygonLight],
     positions: ArrayLike,
     normals: ArrayLike,
@@ -70,8 +70,8 @@ def shade_polygon(
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer, lit by polygons, without occlusion (CSH18 Eq. 12).
 
-    Arguments: `lobes` from `tabulate_brdf`, best with domain="upper"; `light`, one or several; `positions` [..., 3] in
-    world space; `normals`, `views` and, for anisotropic materials, `tangents` [..., 3], and `mask`, as in
+    Arguments: `material` from `tabulate_brdf`, best with domain="upper"; `light`, one or several; `positions` [..., 3]
+    in world space; `normals`, `views` and, for anisotropic materials, `tangents` [..., 3], and `mask`, as in
     `shade_environment`. Returns [..., *colour] in the unit of the emission. What lies below the horizon of a point is
     cut off; a light wholly below it, seen from behind, or whose plane holds the point, adds 0, with gradient 0. A view
     that is not above the horizon gives 0. A NaN anywhere, or a zero normal or view, gives NaN, with NaN gradients.
@@ -85,11 +85,11 @@ def shade_polygon(
     dark in all; of lights with a profile, that of `shade_portal`. Lights of equal shapes (corners, colours, profile)
     are one piece of compiled code, whatever their number. Memory: one tile of 2048 pixels, also for gradients.
     """
-    return _shade_lights(lobes, light, PolygonLight, "light", positions, normals, views, tangents, mask)
+    return _shade_lights(material, light, PolygonLight, "light", positions, normals, views, tangents, mask)
 
 
 def shade_portal(
-    lobes: Lobes,
+    material: Slices,
     portal: PortalLight | Sequence[PortalLight],
     positions: ArrayLike,
     normals: ArrayLike,
@@ -108,7 +108,7 @@ def shade_portal(
     Cost: for every pixel and portal, moments to degree Le + L at twice as many axes (CSH18 Eq. 14 needs all bands of
     the product), and for each colour a product with a matrix [(L+1)^2, (Le+L+1)^2], which is made once in every call.
     """
-    return _shade_lights(lobes, portal, PortalLight, "portal", positions, normals, views, tangents, mask)
+    return _shade_lights(material, portal, PortalLight, "portal", positions, normals, views, tangents, mask)
 
 
 def project_light(
@@ -135,7 +135,7 @@ def project_light(
 
 
 def _shade_lights(
-    lobes: Lobes,
+    material: Slices,
     light: Light | Sequence[Light],
     kind: type,
     name: str,
@@ -145,23 +145,23 @@ def _shade_lights(
     tangents: ArrayLike | None,
     mask: ArrayLike | None,
 ) -> Float[Array, "*batch_colour"]:
-    check_lobes(lobes, everywhere=False)
+    check_slices(material, everywhere=False)
     lights = local_lights(name, light, kind)
     colours = [(f"{name} {i}", x.colour) for i, x in enumerate(lights)]
     vectors = {"positions": positions, "normals": normals, "views": views}
     dtypes = [x.points.dtype for x in lights]
-    lobes, points, colour = surface("lobes", lobes, tangents, colours, dtypes, mask, **vectors)
-    lights = as_type(lights, lobes.weights.dtype)
-    return by_device(shade_points, points, _shade, lobes, lights, colour)
+    material, points, colour = surface("material", material, tangents, colours, dtypes, mask, **vectors)
+    lights = as_type(lights, material.coefficients.dtype)
+    return by_device(shade_points, points, _shade, material, lights, colour)
 
 
 @eqx.filter_jit
 def _shade(
-    points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[Light, ...], colour: tuple[int, ...]
+    points: dict[str, Float[Array, "p 3"]], material: Slices, lights: tuple[Light, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    table = lookup_table(lobes)
+    table = lookup_table(material)
     kinds = stacked(lights)
-    stacks = [(stack, _products(stack, lobes.degree)) for stack in kinds]
+    stacks = [(stack, _products(stack, material.degree)) for stack in kinds]
 
     def radiance(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
@@ -175,18 +175,18 @@ def _shade(
             sign = jnp.where(jnp.max(above, axis=0) > 0, _facing(light, relative), 0)
             outline = _in_frame(frame, relative)
             if product is None:
-                lit = times(_uniform(lobes, table, local, outline, above, sign), _constant_radiance(light))
+                lit = times(_uniform(material, table, local, outline, above, sign), _constant_radiance(light))
             else:
-                lit = _directional(lobes, table, frame, local, outline, product)
+                lit = _directional(material, table, frame, local, outline, product)
             return jnp.broadcast_to(times(lit, sign), zero.shape)
 
         return sum_lights(of_light, stacks, zero)
 
     size = _TILE if all(product is None for _, product in stacks) else _SMALL_TILE
-    return shade_tiles(lobes, points, colour, size, radiance, kinds)
+    return shade_tiles(material, points, colour, size, radiance, kinds)
 
 
-def _uniform(lobes: Lobes, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:
+def _uniform(material: Slices, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:
     """Integrals of slices over the outline above the horizon, [*colour, p]."""
     dark = sign == 0
     spare = outline.shape[1] // 2  # edges, unless the horizon cuts an outline of this tile
@@ -196,30 +196,30 @@ def _uniform(lobes: Lobes, table: Array, local: Array, outline: Loop, above: Arr
         all_whole = jnp.all((jnp.min(above, axis=0) > 0) | dark)
         v = on_sphere(jax.lax.cond(all_whole, whole, lambda: clip(outline, above)))
         angle = loop_solid_angle(v, 2 * np.pi, _up(v))
-        if lobes.isotropic:
-            constant, of_colours = table[..., 0, :] @ lookup_factors(local, lobes), table
-            of_one = lambda t: incidence_integrals(t, local, v, lobes.degree, spare)
+        if material.isotropic:
+            constant, of_colours = table[..., 0, :] @ lookup_factors(local, material), table
+            of_one = lambda t: incidence_integrals(t, local, v, material.degree, spare)
         else:
-            of_colours = slice_values(table, local, lobes)
-            constant, inverse = of_colours[..., 0, :], zonal_inverse(lobes.degree, table.dtype)
+            of_colours = slice_values(table, local, material)
+            constant, inverse = of_colours[..., 0, :], zonal_inverse(material.degree, table.dtype)
             of_one = lambda c: fold_expansion(c, v, *inverse, spare)
         # colours in a loop: compiled code would grow with their number
-        rest = jax.lax.map(of_one, of_colours) if lobes.colour else of_one(of_colours)
+        rest = jax.lax.map(of_one, of_colours) if material.colour else of_one(of_colours)
         return times(constant, angle * _Y_00) + rest
 
-    nothing = lambda: jnp.zeros((*lobes.colour, len(local)), table.dtype)
+    nothing = lambda: jnp.zeros((*material.colour, len(local)), table.dtype)
     return jax.lax.cond(jnp.all(dark), nothing, integrals)
 
 
 def _directional(
-    lobes: Lobes, table: Array, frame: Array, local: Array, outline: Loop, product: Float[Array, "*colour_n_m"]
+    material: Slices, table: Array, frame: Array, local: Array, outline: Loop, product: Float[Array, "*colour_n_m"]
 ) -> Float[Array, "*colour p"]:
     """Integrals of slices times the light's radiance, over its outline above the horizon."""
-    c, v = slice_values(table, local, lobes), on_sphere(clip(outline, outline[2]))
+    c, v = slice_values(table, local, material), on_sphere(clip(outline, outline[2]))
     to_local = jnp.swapaxes(frame, 1, 2)
     world = _in_frame(to_local, v)
     seen = _through(product, world, loop_solid_angle(v, 2 * np.pi, _up(v))).reshape(-1, c.shape[-2], v.shape[2])
-    seen = rotate_many(jnp.moveaxis(seen, 0, 1), to_local, lobes.degree, lobes.isotropic)
+    seen = rotate_many(jnp.moveaxis(seen, 0, 1), to_local, material.degree, material.isotropic)
     seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *c.shape[-2:])
     return jnp.sum(times(c, seen), axis=-2)
 

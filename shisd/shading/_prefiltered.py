@@ -33,8 +33,8 @@ from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.harmonics.internal import bands, quarter_mirror, swap_matrices
 from shisd.shading import _views
-from shisd.shading._lobes import Lobes, check_lobes
 from shisd.shading._surface import as_type, finite_mark, finite_or_nan, in_tiles, masks, shade_points
+from shisd.shading.slices._slices import Slices, check_slices
 
 _TILE, _NUMBERS_AT_ONCE = 1 << 14, 1 << 21  # pixels, and values of all channels for them, at a time
 DARK = 1e-12  # of the brightest colour's mean square: what is below is rounding
@@ -67,16 +67,16 @@ class PrefilteredLobes(Module):
 
 
 def prefilter(
-    lobes: Lobes, light_coefficients: ArrayLike, *, tolerance: float = 1e-2, like: PrefilteredLobes | None = None
+    material: Slices, light_coefficients: ArrayLike, *, tolerance: float = 1e-2, like: PrefilteredLobes | None = None
 ) -> PrefilteredLobes:
     """Filter distant light for one isotropic material, once for any number of pixels: see `shade_prefiltered`.
 
-    Arguments: `lobes` and `light_coefficients` as in `shade_environment`; static `tolerance`, the error to aim at: that
-    of radiance relative to its RMS over all orientations and over the views of a sphere, of the worst colour, against
-    `shade_environment`. As many channels are kept as that takes; `error` of the result is what is predicted for it, and
-    tests find it right within a factor of 2 on photographed maps.
+    Arguments: `material` and `light_coefficients` as in `shade_environment`; static `tolerance`, the error to aim at:
+    that of radiance relative to its RMS over all orientations and over the views of a sphere, of the worst colour,
+    against `shade_environment`. As many channels are kept as that takes; `error` of the result is what is predicted for
+    it, and tests find it right within a factor of 2 on photographed maps.
     Channels are chosen from values, so not under jit, grad or vmap. There pass `like`, an earlier result: its channels
-    are used again and only the tables are made, a pure function of `lobes` and `light_coefficients`, linear in each.
+    are used again and only the tables are made, a pure function of `material` and `light_coefficients`, linear in each.
     `error` is then that of its channels for this material and this light, and nothing holds it below `tolerance`:
     channels chosen for GGX of alpha 0.4 at 1e-2 leave 2.3e-2 at alpha 0.3 and 0.15 at 0.8, at degree 6.
     Derivatives: with `like`, in both; those of channels that stay as they are. So a fit of the light is as good as its
@@ -86,15 +86,15 @@ def prefilter(
     Cost: the maps hold 18 (L+1)^2 texels; each is a Fourier series, summed over rows, then over columns.
     Source: ISD15 Eq. 22, whose zonal maps this extends to orders m > 0.
     """
-    check_lobes(lobes, everywhere=True)
-    if not lobes.isotropic:
-        raise ValueError("`lobes` are anisotropic, which no map of one direction can hold; use shade_environment.")
+    check_slices(material, everywhere=True)
+    if not material.isotropic:
+        raise ValueError("`material` is anisotropic, which no map of one direction can hold; use shade_environment.")
     e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
     tolerance = _checks.number("tolerance", tolerance, positive=True)
-    degree = min(light_degree, lobes.degree)
-    dtype = jnp.promote_types(lobes.weights.dtype, e.dtype)
+    degree = min(light_degree, material.degree)
+    dtype = jnp.promote_types(material.coefficients.dtype, e.dtype)
     e = e[..., : (degree + 1) ** 2].astype(dtype)
-    c = lobes.coefficients()[..., : (degree + 1) ** 2].astype(dtype)
+    c = material.coefficients[..., : (degree + 1) ** 2].astype(dtype)
     c = c.reshape(-1, *c.shape[-2:])
     if like is None:
         try:
@@ -103,7 +103,7 @@ def prefilter(
             raise ValueError(
                 "channels are chosen from values: call prefilter once outside jit and grad, and pass that as `like`."
             ) from error
-        for name, value in zip(("lobes", "light_coefficients"), values, strict=True):
+        for name, value in zip(("material", "light_coefficients"), values, strict=True):
             if not np.all(np.isfinite(value)):
                 raise ValueError(f"`{name}` must be finite; got NaN or infinity.")
         like = _choose(*values, tolerance)
@@ -111,7 +111,7 @@ def prefilter(
         raise ValueError(f"`like` must come from shading.prefilter at degree {degree}.")
     like = jax.lax.stop_gradient(as_type(like, dtype))
     tables = _filter(c, e.reshape(-1, e.shape[-1]), like, jnp.asarray(_swaps(degree), dtype))
-    return dataclasses.replace(like, **tables, colours=(lobes.colour, e.shape[:-1]))
+    return dataclasses.replace(like, **tables, colours=(material.colour, e.shape[:-1]))
 
 
 def shade_prefiltered(

@@ -18,12 +18,12 @@ from shisd._typing import Array, ArrayLike, Float
 from shisd.domains.internal import cap_coefficients
 from shisd.models import SphereLight
 from shisd.models.internal import versine
-from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
 from shisd.shading._surface import as_type, local_lights, shade_points, shade_tiles, stacked, sum_lights, surface
+from shisd.shading.slices._slices import Slices, check_slices, lookup_table, slice_values
 
 
 def shade_sphere(
-    lobes: Lobes,
+    material: Slices,
     light: SphereLight | Sequence[SphereLight],
     positions: ArrayLike,
     normals: ArrayLike,
@@ -34,36 +34,36 @@ def shade_sphere(
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer, lit by balls, without occlusion (ISD15 Eq. 34).
 
-    Arguments: `lobes` from `tabulate_brdf`, with domain="sphere"; `light`, one or several; `positions` [..., 3] in
+    Arguments: `material` from `tabulate_brdf`, with domain="sphere"; `light`, one or several; `positions` [..., 3] in
     world space; the others, `mask` too, and what is returned as in `shade_environment`, in the unit of the emission.
-    What lies below the horizon of a point adds nothing, as far as the lobes' degree resolves the cosine's edge. A point
-    inside a ball has its surface all around; a `radius` that is zero or negative gives NaN.
+    What lies below the horizon of a point adds nothing, as far as the material's degree resolves the cosine's edge. A
+    point inside a ball has its surface all around; a `radius` that is zero or negative gives NaN.
     Derivatives: in every floating argument: position, radius and emission of the lights, positions, material, frame;
     both modes, any order, where the view or a ball lie along the normal the first. Those in position and radius go to
     infinity at the surface of a ball.
     Accuracy: exact for the tabulated slice, to 1e-12 in float64 and 1e-5 of the largest radiance in float32.
     Cost: (L+1)^2 harmonics for every light and point. Memory: one tile of 1024 points.
     """
-    check_lobes(lobes, everywhere=True)
+    check_slices(material, everywhere=True)
     lights = local_lights("light", light, SphereLight)
     colours = [(f"light {i}", x.colour) for i, x in enumerate(lights)]
     vectors = {"positions": positions, "normals": normals, "views": views}
     dtypes = [x.center.dtype for x in lights]
-    lobes, points, colour = surface("lobes", lobes, tangents, colours, dtypes, mask, **vectors)
-    lights = as_type(lights, lobes.weights.dtype)
-    return by_device(shade_points, points, _shade, lobes, lights, colour)
+    material, points, colour = surface("material", material, tangents, colours, dtypes, mask, **vectors)
+    lights = as_type(lights, material.coefficients.dtype)
+    return by_device(shade_points, points, _shade, material, lights, colour)
 
 
 @eqx.filter_jit
 def _shade(
-    points: dict[str, Float[Array, "p 3"]], lobes: Lobes, lights: tuple[SphereLight, ...], colour: tuple[int, ...]
+    points: dict[str, Float[Array, "p 3"]], material: Slices, lights: tuple[SphereLight, ...], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    table, stacks = lookup_table(lobes), stacked(lights)
+    table, stacks = lookup_table(material), stacked(lights)
 
     def radiance(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
     ) -> Float[Array, "*colour p"]:
-        slices = slice_values(table, local, lobes)
+        slices = slice_values(table, local, material)
         zero = jnp.zeros((*colour, len(local)), slices.dtype)
 
         def of_light(light: SphereLight) -> Float[Array, "*colour p"]:
@@ -71,9 +71,9 @@ def _shade(
             t = versine(light, jnp.sum(to_center**2, axis=1))
             inside = (t >= 2)[:, None]  # then any axis will do
             a = jnp.einsum("pij,pi->pj", frame, jnp.where(inside, frame[:, :, 2], to_center))
-            lit = jnp.sum(times(slices, cap_coefficients(t, a, lobes.degree).T), axis=-2)
+            lit = jnp.sum(times(slices, cap_coefficients(t, a, material.degree).T), axis=-2)
             return jnp.broadcast_to(times(lit, light.emission[..., None]), zero.shape)
 
         return sum_lights(of_light, stacks, zero)
 
-    return shade_tiles(lobes, points, colour, 1024, radiance, stacks)
+    return shade_tiles(material, points, colour, 1024, radiance, stacks)

@@ -25,14 +25,14 @@ from shisd.harmonics.internal import Each, pair_many, rows
 from shisd.models import Visibility
 from shisd.models.internal import product_matrices, surface_corners
 from shisd.shading._environment import shade_environment
-from shisd.shading._lobes import Lobes, check_lobes, slice_orders
 from shisd.shading._surface import shade_points, shade_tiles, surface
+from shisd.shading.slices._slices import Slices, check_slices, slice_orders
 
 _NUMBERS_AT_ONCE = 3 << 18  # of visible light in a tile
 
 
 def shade_environment_visibility(
-    lobes: Lobes,
+    material: Slices,
     light_coefficients: ArrayLike,
     visibility: Visibility | ArrayLike,
     normals: ArrayLike,
@@ -49,8 +49,8 @@ def shade_environment_visibility(
     barycentric `weights` [..., 3] there, or without both where it is that of single points, in their order; or SH
     coefficients [n], one visibility for all points, as `models.cap_visibility` gives them; or [..., n] for each. The
     others, `mask` too, and what is returned as in `shade_environment`.
-    Light, visibility and lobes may have any degrees: what is integrated is the product of the three expansions, exact
-    with all bands of the light up to the sum of the degrees of visibility and lobes.
+    Light, visibility and material may have any degrees: what is integrated is the product of the three expansions,
+    exact with all bands of the light up to the sum of the degrees of visibility and material.
     Derivatives: in every floating argument: material, light, visibility, weights, frame.
     Accuracy: 1e-5 in float32 and 1e-12 in float64, relative to the largest radiance, for the expansions given. The band
     limit of visibility blurs shadows over about pi / degree.
@@ -58,7 +58,7 @@ def shade_environment_visibility(
     the world. Memory: one tile of points; coefficients for each point are the caller's.
     Source: ISD15 Eq. 25 and appendix A.
     """
-    check_lobes(lobes, everywhere=True)
+    check_slices(material, everywhere=True)
     e, _ = _checks.expansion("light_coefficients", light_coefficients)
     vectors = {"normals": normals, "views": views}
     if isinstance(visibility, Visibility) and triangle is None and weights is None and len(visibility.triangles) == 0:
@@ -74,21 +74,21 @@ def shade_environment_visibility(
             raise ValueError("`triangle` and `weights` belong to a models.Visibility; pass that as `visibility`.")
         c, _ = _checks.coefficients("visibility", visibility)
         if c.ndim == 1:
-            return shade_environment(lobes, multiply(e, c, lobes.degree), normals, views, tangents, mask=mask)
+            return shade_environment(material, multiply(e, c, material.degree), normals, views, tangents, mask=mask)
         own, v, dtypes = {"visibility": c}, None, [e.dtype, c.dtype]
     light = [("light_coefficients", e.shape[:-1])]
-    lobes, points, colour = surface("lobes", lobes, tangents, light, dtypes, mask, **vectors)
+    material, points, colour = surface("material", material, tangents, light, dtypes, mask, **vectors)
     try:
         np.broadcast_shapes(*(a.shape[:-1] for a in (points | own).values()))
     except ValueError as error:
         shapes = {name: list(a.shape) for name, a in (points | own).items()}
         raise ValueError(f"batch axes {shapes} do not broadcast.") from error
-    dtype = lobes.weights.dtype
+    dtype = material.coefficients.dtype
     if v is None:
         own = {"visibility": own["visibility"].astype(dtype)}
     else:
         v = v.astype(dtype)
-    return by_device(shade_points, points | own, _shade, lobes, e.astype(dtype), v, colour)
+    return by_device(shade_points, points | own, _shade, material, e.astype(dtype), v, colour)
 
 
 def visibility_gamma(light_coefficients: ArrayLike, basis: RotatedZonalBasis, degree: int) -> Float[Array, "*c n l k"]:
@@ -107,10 +107,10 @@ def visibility_gamma(light_coefficients: ArrayLike, basis: RotatedZonalBasis, de
 
 @eqx.filter_jit
 def _shade(
-    points: dict[str, Array], lobes: Lobes, e: Float[Array, "*c n"], v: Array | None, colour: tuple[int, ...]
+    points: dict[str, Array], material: Slices, e: Float[Array, "*c n"], v: Array | None, colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     """Points have "corners" and "weights" of vertices, whose coefficients are `v` [V, nv], or each its "visibility"."""
-    degree, look_up = lobes.degree, slice_orders(lobes, lobes.degree)
+    degree, look_up = material.degree, slice_orders(material, material.degree)
     size = (points["visibility"] if v is None else v).shape[-1]
     product = product_matrices(e, degree, _checks.degree_of(size)).reshape(-1, (degree + 1) ** 2, size)
     product = jnp.pad(product, ((0, 0), (0, 1), (0, 0)))
@@ -119,8 +119,8 @@ def _shade(
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], **at: Array) -> Float[Array, "*colour p"]:
         seen = at["visibility"] if v is None else jnp.einsum("pc,pcn->pn", at["weights"], v[at["corners"]])
         light = Each(*((m.reshape(-1, size) @ seen.T).reshape(*m.shape[:2], -1) for m in (plus, minus)))
-        values = pair_many(*look_up(local), light, jnp.swapaxes(frame, 1, 2), degree, lobes.isotropic)
+        values = pair_many(*look_up(local), light, jnp.swapaxes(frame, 1, 2), degree, material.isotropic)
         return jnp.broadcast_to(values.reshape(*colour, -1), (*colour, len(local)))
 
     tile = _NUMBERS_AT_ONCE // ((degree + 1) ** 2 * len(product))
-    return shade_tiles(lobes, points, colour, max(64, tile), radiance, (e, v))
+    return shade_tiles(material, points, colour, max(64, tile), radiance, (e, v))

@@ -15,12 +15,12 @@ from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.harmonics import sh_basis
 from shisd.harmonics.internal import bands, zonal_norms
-from shisd.shading._lobes import Lobes, check_lobes, lookup_table, slice_values
 from shisd.shading._surface import shade_points, shade_tiles, sum_lights, surface
+from shisd.shading.slices._slices import Slices, check_slices, lookup_table, slice_values
 
 
 def shade_zonal(
-    lobes: Lobes,
+    material: Slices,
     axis: ArrayLike,
     zonal_coefficients: ArrayLike,
     normals: ArrayLike,
@@ -31,7 +31,7 @@ def shade_zonal(
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer under distant light that is symmetric about an axis.
 
-    Arguments: `lobes` from `tabulate_brdf`; `axis` [3] in world space, of any length but zero; `zonal_coefficients`
+    Arguments: `material` from `tabulate_brdf`; `axis` [3] in world space, of any length but zero; `zonal_coefficients`
     [*colour, L+1], those of y_l^0 about it (those of usual profiles: `decomposition.CapKernel`, `GaussianKernel`, ...,
     `.zonal`); for S lights [S, 3] and [S, *colour, L+1]; the others, `mask` too, and what is returned as in
     `shade_environment`.
@@ -41,7 +41,7 @@ def shade_zonal(
     Cost: (L+1)^2 harmonics per pixel and light where `shade_environment` rotates, about L^3 products.
     Source: ISD15 Eq. 23 and 24.
     """
-    check_lobes(lobes, everywhere=True)
+    check_slices(material, everywhere=True)
     a, z = _checks.vectors("axis", axis), _checks.real_array("zonal_coefficients", zonal_coefficients)
     if a.ndim > 2 or 0 in a.shape:
         raise ValueError(f"`axis` must have shape [3], or [S, 3] for S lights; got {list(a.shape)}.")
@@ -54,16 +54,17 @@ def shade_zonal(
     if not lights:
         a, z = a[None], z[None]
     light, dtypes = [("zonal_coefficients", z.shape[1:-1])], [a.dtype, z.dtype]
-    lobes, points, colour = surface("lobes", lobes, tangents, light, dtypes, mask, normals=normals, views=views)
-    dtype = lobes.weights.dtype
-    z = z[..., : lobes.degree + 1].astype(dtype)
-    return by_device(shade_points, points, _shade, lobes, normalize(a.astype(dtype)), z, colour)
+    vectors = {"normals": normals, "views": views}
+    material, points, colour = surface("material", material, tangents, light, dtypes, mask, **vectors)
+    dtype = material.coefficients.dtype
+    z = z[..., : material.degree + 1].astype(dtype)
+    return by_device(shade_points, points, _shade, material, normalize(a.astype(dtype)), z, colour)
 
 
 @eqx.filter_jit
 def _shade(
     points: dict[str, Float[Array, "p 3"]],
-    lobes: Lobes,
+    material: Slices,
     axes: Float[Array, "s 3"],
     z: Float[Array, "s *c l"],
     colour: tuple[int, ...],
@@ -72,10 +73,10 @@ def _shade(
     l = bands(degree)
     z = (z / jnp.broadcast_to(jnp.asarray(zonal_norms(degree), z.dtype), z.shape))[..., l]
 
-    table = lookup_table(lobes, degree)
+    table = lookup_table(material, degree)
 
     def radiance(frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"]) -> Float[Array, "*colour p"]:
-        slices = slice_values(table, local, lobes)
+        slices = slice_values(table, local, material)
 
         def of_light(one: tuple[Array, Array]) -> Float[Array, "*c n p"]:
             axis, own = one
@@ -84,4 +85,4 @@ def _shade(
         light = sum_lights(of_light, [(axes, z)], jnp.zeros((*z.shape[1:], len(local)), z.dtype))
         return jnp.sum(times(slices, light), axis=-2)
 
-    return shade_tiles(lobes, points, colour, 1024, radiance, (axes, z))
+    return shade_tiles(material, points, colour, 1024, radiance, (axes, z))

@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
+from shisd.shading._lobes import lookup_table
 
 from shisd._numerics import dot
 from shisd.domains._integrate import loop_coefficients, zonal_inverse
 from shisd.domains._polygon import clip, loop_solid_angle, on_sphere
 from shisd.harmonics import _tables, sh_basis
 from shisd.shading import _views
-from shisd.shading._lobes import lookup_table
 from tests.bench import sh_rotation
 from tests.bench.polygons import line_coefficients
 

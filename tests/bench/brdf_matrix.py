@@ -12,9 +12,9 @@ from collections.abc import Callable, Hashable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from shisd.shading._lobes import project_slice
 
 from shisd import decomposition, models, shading
-from shisd.shading._lobes import project_slice
 from tests.bench.timing import interleaved
 
 COUNT = 16384

@@ -15,12 +15,12 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from shisd.shading._lobes import lookup_table, slice_values
 
 from examples import _scene
 from shisd import decomposition, harmonics, models, reference, shading
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
-from shisd.shading._lobes import lookup_table, slice_values
 from shisd.shading._surface import frame
 from tests.bench.timing import interleaved
 

@@ -24,8 +24,8 @@ degree = 2
 basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
 directions = basis.directions
 weights = jnp.asarray(rng.normal(size=(3, 4, degree + 1, len(directions))), jnp.float32)
-lobes = shading.Lobes(basis, weights, jnp.zeros((), jnp.float32), True)
-upper = shading.Lobes(basis, weights, jnp.zeros((), jnp.float32), True, "upper")
+lobes = shading.Slices.from_weights(basis, weights)
+upper = shading.Slices.from_weights(basis, weights, domain="upper")
 light = jnp.asarray(rng.normal(size=(3, (degree + 1) ** 2)), jnp.float32)
 corners = np.asarray([[1, -0.5, 0.2], [1, 0.5, 0.2], [1, 0, 1]], np.float32)
 lamp = models.PolygonLight(corners, np.ones(3, np.float32))

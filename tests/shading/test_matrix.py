@@ -37,12 +37,8 @@ def matrix_of(kind, dtype):
 def both_of(domain, dtype):
     """The table and the matrix of one material, degree 6; 16 views, and 8 degrees more for the views."""
     brdf = models.Ggx(np.asarray(0.4, dtype), np.asarray(0.04, dtype))
-    table = shading.tabulate_brdf(brdf, basis_of(6, dtype), views=16, domain=domain)
+    table = shading.tabulate_brdf(brdf, 6, views=16, domain=domain)
     return table, shading.project_brdf(brdf, 6, domain=domain)
-
-
-def basis_of(degree, dtype):
-    return decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree).astype(dtype), degree)
 
 
 def slices_of(kind, w, wo):
@@ -92,7 +88,7 @@ def test_elements_are_integrals_over_both_directions(kind, dtype):
 def test_slices_are_those_of_the_table(domain, dtype):
     """The table holds slices of each view, without any expansion over views."""
     table, matrix = both_of(domain, dtype)
-    got, expected = (np.asarray(x.coefficients(**v), float) for x, v in ((matrix, {"views": 16}), (table, {})))
+    got, expected = (np.asarray(x.coefficients, float) for x in (matrix.slices(views=16), table))
     w, area = sphere(20, 40) if domain == "sphere" else hemisphere_rule(20, 40)  # where norms are taken
     norm = lambda c: np.sqrt(np.square(c @ scipy_basis(w, 6).T) @ area)
     ratio = norm(got - expected) / norm(expected)
@@ -146,7 +142,7 @@ def test_radiance_is_the_product_of_slice_and_light(kind, dtype, rng):
 def test_matrix_and_table_shade_alike(rng):
     matrix = matrix_of("isotropic", SINGLE)
     light, normals, views, _ = scene(rng, 200, np.float32)
-    expected = shading.shade_environment(matrix.lobes(basis_of(DEGREE, np.float32)), light, normals, views)
+    expected = shading.shade_environment(matrix.slices(), light, normals, views)
     got = shading.shade_matrix(matrix, light, normals, views)
     np.testing.assert_allclose(got, expected, atol=1e-4 * np.max(np.abs(expected)))
     low = shading.shade_matrix(matrix, light[:, :4], normals, views)  # a light of fewer bands
@@ -237,7 +233,7 @@ def test_errors_name_the_argument(as_user, rng):
     with pytest.raises(ValueError, match=r"`tangents` \[..., 3\] are needed"):
         shading.shade_matrix(matrix, light, normals, views)
     with pytest.raises(ValueError, match="`basis` must be a decomposition.RotatedZonalBasis of degree 3"):
-        matrix.lobes(basis_of(2, np.float32))
+        matrix.slices().weights(decomposition.RotatedZonalBasis(decomposition.optimized_directions(2), 2))
     with pytest.raises(ValueError, match="`material` must come from shading.tabulate_brdf or shading.project_brdf"):
         shading.material_degree(1, 0.1)
     with pytest.raises(ValueError, match="`tolerance` must be > 0; got 0"):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from shisd import decomposition, domains, models, reference, shading
+from shisd import domains, models, reference, shading
 from tests import truth
 from tests.hard_cases import unit
-from tests.shading.lobes import cosine_lobes, random_lobes
+from tests.shading.slices import cosine_slices, random_slices
 
 QUAD = np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]])  # emits downwards
 DEGREE, COUNT = 4, 8  # of slices; of points that are shaded together, so that all share compiled code
@@ -59,13 +59,13 @@ def quadrature(integrand, points, position, normal, nodes=24):
     return np.sign(float(area.sum())) * area.astype(float) @ integrand(w.astype(float), frame)
 
 
-_slices = jax.jit(jax.vmap(lambda lobes, view: lobes.slice_coefficients(view), (None, 0)))
+_slices = jax.jit(jax.vmap(lambda lobes, view: lobes.at(view), (None, 0)))
 
 
 def expected_radiance(lobes, light, position, normal, view, points=QUAD):
     """The clipped integral of the interpolated slice times light(world directions) [N, ...], SciPy's harmonics."""
     frames = np.stack([local_outline(points, p, n)[1] for p, n in zip(position, normal, strict=True)])
-    local = np.einsum("pij,pj->pi", frames, unit(view)).astype(lobes.weights.dtype)
+    local = np.einsum("pij,pj->pi", frames, unit(view)).astype(lobes.coefficients.dtype)
     radiance = []
     for p, n, c in zip(position, normal, np.asarray(_slices(lobes, local), float), strict=True):
         values = lambda w, frame, c=c: ((truth.scipy_basis(w, DEGREE) @ c) * light(w @ frame).T).T
@@ -97,18 +97,17 @@ def form_factors(points, position, normal):
 
 @functools.cache
 def lobes_of(name, degree, dtype, domain="upper"):
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree, dtype=dtype), degree)
-    return shading.tabulate_brdf(BRDFS[name](), basis, domain=domain)
+    return shading.tabulate_brdf(BRDFS[name](), degree, domain=domain)
 
 
 @functools.cache
 def slices(dtype):
-    return random_lobes(DEGREE, np.dtype(dtype), domain="upper")
+    return random_slices(DEGREE, np.dtype(dtype), domain="upper")
 
 
 @functools.cache
 def white(dtype):
-    return cosine_lobes(DEGREE, np.dtype(dtype))
+    return cosine_slices(DEGREE, np.dtype(dtype))
 
 
 @jax.jit
@@ -123,7 +122,7 @@ def _shade(lobes, geometry, weights):
 def shade(lobes, points, position, normal, view, weights=None):
     """Radiance [COUNT] of a two-sided light of at most five corners, and gradients of weights @ radiance by them."""
     five = points[np.minimum(np.arange(5), len(points) - 1)]
-    dtype = lobes.weights.dtype
+    dtype = lobes.coefficients.dtype
     weights = np.ones(COUNT) if weights is None else weights
     geometry = [np.asarray(a, dtype) for a in (five, position, normal, view)]
     value, (d_points, *rest) = jax.tree.map(np.asarray, _shade(lobes, geometry, np.asarray(weights, dtype)))
@@ -286,7 +285,7 @@ def test_code_does_not_grow_with_lights_and_colours(rng):
         return len(jax.jit(shade).lower(quads[:count]).as_text().splitlines())
 
     assert size(slices("float32"), 20) < 1.1 * size(slices("float32"), 2)
-    one, rgb = (size(random_lobes(2, np.dtype("float32"), c, domain="upper"), 1) for c in ((), (3,)))
+    one, rgb = (size(random_slices(2, np.dtype("float32"), c, domain="upper"), 1) for c in ((), (3,)))
     assert rgb < 1.1 * one
 
 
@@ -428,12 +427,12 @@ def test_derivatives_of_views_near_the_normal(sine, x64, rng):
     x = unit(np.cross(normal, [0.3, 0.5, -0.7]))
     view = normal + sine * (np.cos(azimuth) * x + np.sin(azimuth) * np.cross(normal, x))
 
-    def radiance(weights, points, view, normal):
-        material = eqx.tree_at(lambda m: m.weights, lobes, jnp.asarray(weights))
+    def radiance(coefficients, points, view, normal):
+        material = eqx.tree_at(lambda m: m.coefficients, lobes, jnp.asarray(coefficients))
         return shading.shade_polygon(material, models.PolygonLight(points), position[2:], normal[2:], view[2:])
 
-    arguments = (lobes.weights, QUAD, view, normal)
-    for i, x in enumerate(arguments):  # a change of all weights is rough in the view: not both at a time
+    arguments = (lobes.coefficients, QUAD, view, normal)
+    for i, x in enumerate(arguments):  # a change of all coefficients is rough in the view: not both at a time
         only = lambda x, i=i: radiance(*arguments[:i], x, *arguments[i + 1 :])
         check_grads(only, (jnp.asarray(x),), order=1, rtol=1e-6, atol=1e-8)
 
@@ -465,4 +464,4 @@ def test_bad_input_is_named(as_user):
     with pytest.raises(ValueError, match="do not broadcast"):
         models.PolygonLight(QUAD, np.ones(2), profile=np.ones((3, 4)))
     with pytest.raises(ValueError, match="`domain` must be"):
-        shading.tabulate_brdf(models.Lambertian(0.5), lobes.basis, domain="lower")
+        shading.tabulate_brdf(models.Lambertian(0.5), 2, domain="lower")

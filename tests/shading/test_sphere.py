@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from shisd import decomposition, models, shading
+from shisd import models, shading
 from shisd.shading import _views
 from tests.hard_cases import ring, unit
 from tests.marks import FLOAT32_FIRST, FLOAT64_FIRST
-from tests.shading.lobes import random_lobes
+from tests.shading.slices import random_slices
 from tests.truth import scipy_basis
 
 DEGREE, VIEWS = 6, 8
@@ -54,7 +54,7 @@ def test_zonal_coefficients_are_integrals_over_the_cap(dtype):
 
 @FLOAT64_FIRST
 def test_it_is_the_integral_of_the_slice_over_the_cap(dtype, rng):
-    lobes = random_lobes(DEGREE, dtype)
+    lobes = random_slices(DEGREE, dtype)
     node = 5
     view = np.array([np.sin(_views.elevations(VIEWS)[node]), 0, np.cos(_views.elevations(VIEWS)[node])])
     c = np.asarray(lobes.coefficients()[node], float)
@@ -74,7 +74,7 @@ def test_it_is_the_integral_of_the_slice_over_the_cap(dtype, rng):
 
 @pytest.mark.slow
 def test_a_polygon_of_64_corners_is_nearly_a_ball(x64, rng):
-    lobes = random_lobes(DEGREE, np.float64)
+    lobes = random_slices(DEGREE, np.float64)
     center, angle, corners = np.array([0.4, -0.3, 2.0]), 0.3, 64
     solid_angle = 2 * np.pi * (1 - np.cos(angle))
     # the ring whose polygon has the solid angle of the cap: sum of angles, 64 times those of one corner
@@ -94,7 +94,7 @@ def test_a_polygon_of_64_corners_is_nearly_a_ball(x64, rng):
 @pytest.mark.slow
 @FLOAT32_FIRST
 def test_several_balls_and_colours(dtype, rng):
-    lobes = random_lobes(DEGREE, dtype, (3,))
+    lobes = random_slices(DEGREE, dtype, (3,))
     lights = [models.SphereLight(np.array([0.5, 0.2, 3.0], dtype), 0.5, np.array([3.0, 2.0, 1.0], dtype)),
               models.SphereLight(np.array([-2.0, 0.2, 1.0], dtype), 1.5)]  # fmt: skip
     normals, positions = unit(rng.normal(size=(4, 3))).astype(dtype), (0.1 * rng.normal(size=(4, 3))).astype(dtype)
@@ -111,8 +111,7 @@ def test_several_balls_and_colours(dtype, rng):
 
 @pytest.mark.slow
 def test_anisotropic(x64, rng):
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(DEGREE), DEGREE)
-    lobes = shading.tabulate_brdf(models.Ggx(np.array([0.3, 0.6])), basis, views=VIEWS, azimuths=16)
+    lobes = shading.tabulate_brdf(models.Ggx(np.array([0.3, 0.6])), DEGREE, views=VIEWS, azimuths=16)
     light = models.SphereLight(np.array([0.5, 0.2, 3.0]), 0.7)
     normals, tangents = unit(rng.normal(size=(2, 4, 3)))
     views = unit(normals + 0.5 * rng.normal(size=(4, 3)))
@@ -122,7 +121,7 @@ def test_anisotropic(x64, rng):
 
 
 def test_inside_the_ball_light_is_all_around(x64, rng):
-    lobes = random_lobes(DEGREE, np.float64)
+    lobes = random_slices(DEGREE, np.float64)
     normals, views = np.array([[0.0, 0, 1]] * 3), unit(np.array([[0.3, 0.1, 1]] * 3))
     positions = np.array([[0.0, 0, 0], [0.5, 0.5, 0.2], [0.0, 0.0, -0.999]])
     ball = lambda radius: models.SphereLight(jnp.zeros(3), radius, 2.0)
@@ -137,7 +136,7 @@ def test_inside_the_ball_light_is_all_around(x64, rng):
 
 @pytest.mark.slow
 def test_derivatives(x64, rng):
-    lobes = random_lobes(DEGREE, np.float64)
+    lobes = random_slices(DEGREE, np.float64)
     normals = unit(rng.normal(size=(3, 3)))
     views, positions = unit(normals + 0.6 * rng.normal(size=(3, 3))), rng.normal(size=(3, 3))
     views[0] = normals[0]
@@ -155,7 +154,7 @@ def test_derivatives(x64, rng):
 
 
 def test_errors_name_the_argument(as_user):
-    lobes = random_lobes(DEGREE, np.float32)
+    lobes = random_slices(DEGREE, np.float32)
     p, n = np.zeros((2, 3), np.float32), np.array([[0, 0, 1.0]] * 2, np.float32)
     light = models.SphereLight(np.ones(3, np.float32), 0.5)
     with pytest.raises(ValueError, match=r"`center` must have shape \[3\] and `radius` be one number; got \[1, 3\]"):

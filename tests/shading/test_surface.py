@@ -11,19 +11,18 @@ import pytest
 from shisd import models, shading
 from shisd.shading import _surface
 from tests.hard_cases import unit
-from tests.shading.lobes import random_lobes
+from tests.shading.slices import random_slices
 
 COUNT = 4
 SQUARE = np.array([[1, -1, 2], [-1, -1, 2], [-1, 1, 2], [1, 1, 2]], np.float32)  # emits downwards
 FLOAT32 = np.dtype("float32")
-sphere, upper = (functools.cache(functools.partial(random_lobes, 1, FLOAT32, domain=d)) for d in ("sphere", "upper"))
+sphere, upper = (functools.cache(functools.partial(random_slices, 1, FLOAT32, domain=d)) for d in ("sphere", "upper"))
 
 
 @functools.cache
 def brushed():
-    basis, flat = sphere().basis, sphere().weights
-    weights = np.array(flat)[:, None] * np.float32([1, 0.5, 0.8, 1.5])[None, :, None, None]
-    return shading.Lobes(basis, jnp.asarray(weights), flat[0, 0, 0], isotropic=False)
+    c = np.array(sphere().coefficients)[:, None] * np.float32([1, 0.5, 0.8, 1.5])[None, :, None]
+    return shading.Slices(c, isotropic=False)
 
 
 def of_positions(verb, light):
@@ -82,7 +81,9 @@ EACH = {  # what shades, its light, and which arrays of points it takes
         LOCAL,
     ),
     "polygon": (
-        of_positions(lambda *a, **k: shading.shade_polygon(upper(), *a, **k), models.PolygonLight), SQUARE, LOCAL
+        of_positions(lambda *a, **k: shading.shade_polygon(upper(), *a, **k), models.PolygonLight),
+        SQUARE,
+        LOCAL,
     ),
     "portal": (
         of_positions(

@@ -11,7 +11,7 @@ from shisd.models import _visibility
 from shisd.shading import _views
 from tests.hard_cases import unit
 from tests.marks import FLOAT32_FIRST
-from tests.shading.lobes import random_lobes
+from tests.shading.slices import random_slices
 from tests.truth import scipy_basis
 
 LOBES, LIGHT, SEEN = 5, 7, 4  # degrees
@@ -43,7 +43,7 @@ def quadrature(c, e, v, frame):
 
 @FLOAT32_FIRST
 def test_it_is_the_integral_of_the_three_expansions(dtype, rng):
-    lobes = random_lobes(LOBES, dtype)
+    lobes = random_slices(LOBES, dtype)
     e, seen, triangle, weights, frames = scene(rng, dtype)
     normals, views = frames[:, :, 2].astype(dtype), (frames @ VIEW).astype(dtype)
     got = shading.shade_environment_visibility(lobes, e, seen, normals, views, triangle=triangle, weights=weights)
@@ -62,7 +62,7 @@ def test_it_is_the_integral_of_the_three_expansions(dtype, rng):
 
 @pytest.mark.slow
 def test_the_triple_product_and_the_shader_of_the_paper_agree(x64, rng):
-    lobes = random_lobes(LOBES, np.float64)
+    lobes = random_slices(LOBES, np.float64)
     e, seen, triangle, weights, frames = scene(rng, np.float64, count=2)
     normals, views = frames[:, :, 2], frames @ VIEW
     got = shading.shade_environment_visibility(lobes, e, seen, normals, views, triangle=triangle, weights=weights)
@@ -84,7 +84,7 @@ def test_the_triple_product_and_the_shader_of_the_paper_agree(x64, rng):
 
 @FLOAT32_FIRST
 def test_nothing_hidden_is_the_environment_and_everything_is_dark(dtype, rng):
-    lobes = random_lobes(LOBES, dtype)
+    lobes = random_slices(LOBES, dtype)
     e, _, _, _, frames = scene(rng, dtype)
     normals, views = frames[:, :, 2].astype(dtype), (frames @ VIEW).astype(dtype)
     caps = np.asarray(models.cap_visibility(np.array([0, 0, 1], dtype), np.array([0, np.pi], dtype), SEEN))
@@ -109,7 +109,7 @@ def test_caps_are_integrals_over_what_they_leave(dtype):
 
 @pytest.mark.slow
 def test_derivatives(x64, rng):
-    lobes = random_lobes(LOBES, np.float64)
+    lobes = random_slices(LOBES, np.float64)
     e, seen, triangle, weights, frames = scene(rng, np.float64, count=3)
     normals, views = frames[:, :, 2], frames @ VIEW
     views[0] = normals[0]
@@ -317,7 +317,7 @@ def test_errors_name_the_argument(as_user, rng):
     for offset in (-1.0, np.nan, np.inf, [0.1]):
         with pytest.raises(ValueError, match="`offset` must be a number >= 0"):
             make(points, faces, 3, offset=offset)
-    lobes = random_lobes(LOBES, np.float32)
+    lobes = random_slices(LOBES, np.float32)
     e, seen, triangle, weights, frames = scene(rng, np.float32)
     n = frames[:, :, 2].astype(np.float32)
     shade = lambda v, **at: shading.shade_environment_visibility(lobes, e, v, n, n, **at)

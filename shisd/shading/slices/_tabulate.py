@@ -1,4 +1,4 @@
-"""Materials as weights on rotated zonal harmonics: cosine-weighted slices over local view directions (ISD15 Eq. 21).
+"""Materials as slices: cosine-weighted, by view, integrated over all directions of light (ISD15 Eq. 21).
 
 The slices are integrated in polar coordinates about the mirror direction, graded to the width of the lobe, up to the
 horizon exactly: a fixed number of nodes serves every roughness, and the cut of max(cos, 0) costs no accuracy.
@@ -7,7 +7,6 @@ notation: wo = view at elevation theta_o; r = its mirror direction; w = cos(psi)
 a = the unit vector at r that points up, b = horizontal; w is above the horizon for psi < psi_max(chi).
 """
 
-import functools
 import math
 from collections.abc import Callable
 from typing import Literal, TypeVar
@@ -20,157 +19,21 @@ from jax.core import Tracer
 from jax.typing import DTypeLike
 
 from shisd import _checks
-from shisd._methods import method
-from shisd._module import Module
 from shisd._numerics import safe_sqrt
 from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics.internal import associated_legendre, bands, orders, rows, weighted_sums
+from shisd.harmonics.internal import orders, weighted_sums
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
+from shisd.shading.slices._slices import Slices, check_domain
+from shisd.shading.slices._upper import RIDGE, fit_above, hemisphere_modes, unit_gauss
 
 Pytree = TypeVar("Pytree")
-RIDGE = 1e-6  # of fits above the horizon
-
-
-class Lobes(Module):
-    """RZH weights of a material's cosine-weighted slices, tabulated over local view directions (ISD15 Eq. 21).
-
-    weights: [*colour, V, L+1, K] for isotropic materials, in views at elevations (j + 1/2) (pi/2)/V from the normal and
-    azimuth 0 (the slice of azimuth phi is this one turned by phi); [*colour, V, A, L+1, K] for anisotropic ones, with
-    azimuths 2 pi i/A. `quadrature_error`: that of the slices, estimated, relative to their RMS over the picture of a
-    sphere (see `tabulate_brdf`). `domain`: where the slices stand for the material, everywhere or only above the
-    horizon.
-    """
-
-    basis: RotatedZonalBasis
-    weights: Float[Array, "*colour_views l k"]
-    quadrature_error: Scalar
-    isotropic: bool = eqx.field(static=True)
-    domain: Literal["sphere", "upper"] = eqx.field(static=True, default="sphere")
-
-    @property
-    def degree(self) -> int:
-        return self.basis.degree
-
-    @property
-    def colour(self) -> tuple[int, ...]:
-        return self.weights.shape[: -3 if self.isotropic else -4]
-
-    @method
-    def coefficients(self) -> Float[Array, "*colour_views n"]:
-        """SH coefficients of the tabulated slices: [*colour, V, (L+1)^2] or [*colour, V, A, (L+1)^2]."""
-        return self.basis.unchecked_coefficients(self.weights)
-
-    @method
-    def slice_coefficients(self, view: Float[Array, "3"]) -> Float[Array, "*colour n"]:
-        """SH coefficients, in the local frame, of the slice seen from the local direction `view` [3], interpolated.
-
-        Derivatives: in the view, the weights and the lobe directions, also at the normal.
-        """
-        table = lookup_table(self)
-        view = _checks.vectors("view", view).astype(table.dtype)
-        return slice_values(table, view[None], self)[..., 0]
-
-    @method
-    def slice_weights(self, view: Float[Array, "3"]) -> Float[Array, "*colour l k"]:
-        """RZH weights lambda of the slice seen from the local direction `view` [3] (ISD15 Eq. 22), of least norm."""
-        return self.basis.weights(self.slice_coefficients(view))
-
-
-def check_lobes(lobes: object, *, everywhere: bool) -> None:
-    """Lobes that stand for the material `everywhere`, or above the horizon at least."""
-    if not isinstance(lobes, Lobes):
-        raise ValueError(f"`lobes` must come from shading.tabulate_brdf; got {type(lobes).__name__}.")
-    if everywhere and lobes.domain != "sphere":
-        raise ValueError("`lobes` were fitted above the horizon only; tabulate them with domain='sphere'.")
-
-
-def lookup_table(lobes: Lobes, degree: int | None = None) -> Float[Array, "*colour n columns"]:
-    """What `slice_values` looks up, up to `degree`: splines in elevation times Fourier series in azimuth.
-
-    Columns: V+4 spline coefficients; for anisotropic materials, that for every cosine, then every sine component.
-    """
-    degree = lobes.degree if degree is None else degree
-    c = lobes.coefficients()[..., : (degree + 1) ** 2]
-    if lobes.isotropic:
-        return _views.spline_table(jnp.swapaxes(c, -1, -2), np.abs(orders(degree)))
-    azimuths = c.shape[-2]
-    k = np.arange(azimuths // 2 + 1)
-    phases = np.outer(k, 2 * np.pi * np.arange(azimuths) / azimuths)
-    norm = np.where((k == 0) | (2 * k == azimuths), 1, 2)[:, None] / azimuths
-    parts = []
-    for wave in (np.cos(phases) * norm, np.sin(phases) * norm):
-        component = jnp.einsum("ka,...van->...nkv", jnp.asarray(wave, c.dtype), c)
-        spline = _views.spline_table(component, k)
-        parts.append(spline.reshape(*spline.shape[:-2], -1))
-    return jnp.concatenate(parts, axis=-1)
-
-
-def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p 3"], lobes: Lobes) -> Array:
-    """Interpolated SH coefficients of the slices, in the local frame: [*colour, n, p]."""
-    c = table @ lookup_factors(view, lobes)
-    if not lobes.isotropic:
-        return c
-    # the table holds the slice of azimuth 0; turned by phi, m mixes with -m
-    degree = _checks.degree_of(table.shape[-2])
-    m, l = orders(degree), bands(degree)
-    cos, sin = _views.azimuth_factors(view, degree + 1)
-    sin = sin[np.abs(m)] * jnp.asarray(-np.sign(m)[:, None], c.dtype)
-    cos, sin = (jnp.broadcast_to(f, c.shape) for f in (cos[np.abs(m)], sin))
-    return cos * c + sin * c[..., l * l + l - m, :]
-
-
-def slice_orders(lobes: Lobes, degree: int) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:
-    """`slice_values` in the order of `harmonics._pairing`, m >= 0 and m < 0 apart: two arrays [rows, colours, p]."""
-    waves = _views.azimuth_factors if lobes.isotropic else None
-    return products_in_order(lookup_table(lobes, degree), degree, lambda view: lookup_factors(view, lobes), waves)
-
-
-def products_in_order(
-    table: Float[Array, "*colour n columns"],
-    degree: int,
-    factors: Callable[[Float[Array, "p 3"]], Float[Array, "columns p"]],
-    waves: Callable[[Float[Array, "p 3"], int], tuple[Array, Array]] | None,
-) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:
-    """table @ factors(view) in the order of `harmonics._pairing`: two arrays [rows, colours, p] for every view.
-
-    Of isotropic materials only rows m >= 0, at azimuth 0; `waves(view, L+1)` are the cosines and sines for the others.
-    """
-    table = jnp.pad(table.reshape(-1, *table.shape[-2:]), ((0, 0), (0, 1), (0, 0)))
-    *signs, k = rows(degree)
-    plus, minus = (jnp.swapaxes(table[:, index], 0, 1) for index in signs)
-    spread = jnp.asarray(k[:, None] == np.arange(max(degree, 1) + 1), table.dtype)
-
-    def product(table: Float[Array, "rows colours columns"], factors: Float[Array, "columns p"]) -> Array:
-        flat = table.reshape(-1, table.shape[-1])  # a product of matrices, and so is its transpose
-        return (flat @ factors).reshape(*table.shape[:2], -1)
-
-    def look_up(view: Float[Array, "p 3"]) -> tuple[Array, Array]:
-        columns = factors(view)
-        x = product(plus, columns)
-        if waves is None:
-            return x, product(minus, columns)
-        # a product with a 0-1 matrix, whose transpose is one too: that of an indexed copy would be slow
-        cos, sin = ((spread @ f)[:, None] for f in waves(view, max(degree, 1) + 1))
-        return cos * x, sin * x
-
-    return look_up
-
-
-def lookup_factors(view: Float[Array, "p 3"], lobes: Lobes) -> Float[Array, "columns p"]:
-    """What the columns of `lookup_table` are multiplied by."""
-    if lobes.isotropic:
-        return _views.spline_weights(_views.elevation(view), lobes.weights.shape[-3])
-    spline = _views.spline_weights(_views.elevation(view), lobes.weights.shape[-4])
-    waves = jnp.stack(_views.azimuth_factors(view, lobes.weights.shape[-3] // 2 + 1))  # [2, k, p]
-    return (waves[:, :, None] * spline[None, None]).reshape(-1, view.shape[0])
 
 
 def tabulate_brdf(
     brdf: AbstractBrdf,
-    basis: RotatedZonalBasis,
+    degree: int,
     *,
     views: int = 64,
     azimuths: int | None = None,
@@ -180,15 +43,15 @@ def tabulate_brdf(
     tolerance: float = 1e-3,
     throw: bool = True,
     progress: Progress = None,
-) -> Lobes:
-    """RZH weights of a material: its cosine-weighted view slices, projected and decomposed (ISD15 Eq. 21).
+) -> Slices:
+    """A material's cosine-weighted view slices, projected on spherical harmonics (ISD15 Eq. 21).
 
-    Arguments: `brdf`; the `basis` to decompose into. Static: `views`, elevations of the table, at least 4; `azimuths`,
+    Arguments: `brdf`. Static: `degree`; `views`, elevations of the table, at least 4; `azimuths`,
     even, for anisotropic materials only, by default 2 degree + 4 and at least 32: a slice turns with the view, so its
     order m goes round m times, and fewer azimuths alias without notice; `quadrature`, nodes from the mirror direction
     to the horizon (and half as many in each eighth of a turn about it).
     `quadrature` None takes 32 + degree nodes, and 3/2 and 9/4 as many where that is not enough: where
-    `Lobes.quadrature_error` is above `tolerance`. If no rule, or the one given, is enough, it is a ValueError;
+    `Slices.quadrature_error` is above `tolerance`. If no rule, or the one given, is enough, it is a ValueError;
     `throw=False` leaves that to the caller. While JAX traces, as under jit and grad, nothing can be chosen: 32 + degree
     nodes are taken unless `quadrature` says otherwise, and it is an error at run time where they are not enough. The
     error is estimated from what the last quarter of the nodes changes in the slices, a, and the quarter before, b: as
@@ -197,9 +60,9 @@ def tabulate_brdf(
     (`shade_polygon`): the kink of the cosine is no longer expanded, and errors are up to 100 times smaller. `ridge`
     limits what the fit may do below the horizon: rounding grows like 1/sqrt(ridge), measured 1e-5 in float32 at the
     default. `progress`: None, True for a bar of tqdm, or a function of (done, total) elevations, told for every rule
-    that is tried; not while JAX traces. The result has the dtype of the basis.
-    Derivatives: in every parameter of the material and in the lobe directions, both modes. The nodes follow
-    `brdf.lobe_width`, through which no derivative passes.
+    that is tried; not while JAX traces. The result has the dtype of the material's parameters.
+    Derivatives: in every parameter of the material, both modes. The nodes follow `brdf.lobe_width`, through which no
+    derivative passes.
     Accuracy: `quadrature_error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's
     format at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in
     float32, 2e-7 for GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1;
@@ -208,21 +71,16 @@ def tabulate_brdf(
     """
     if not isinstance(brdf, AbstractBrdf):
         raise ValueError(f"`brdf` must be a models.AbstractBrdf; got {type(brdf).__name__}.")
-    if not isinstance(basis, RotatedZonalBasis):
-        raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis; got {type(basis).__name__}.")
-    views = _checks.integer("views", views, 4)
-    azimuths = max(32, 2 * basis.degree + 4) if azimuths is None else _checks.integer("azimuths", azimuths, 4)
+    degree, views = _checks.degree(degree), _checks.integer("views", views, 4)
+    azimuths = max(32, 2 * degree + 4) if azimuths is None else _checks.integer("azimuths", azimuths, 4)
     if azimuths % 2:
         raise ValueError(f"`azimuths` must be even; got {azimuths}.")
-    if domain not in ("sphere", "upper"):
-        raise ValueError(f"`domain` must be 'sphere' or 'upper'; got {domain!r}.")
+    check_domain(domain)
     ridge, tolerance = (_checks.number(n, v, positive=True) for n, v in (("ridge", ridge), ("tolerance", tolerance)))
-    fit = ridge if domain == "upper" else None
-    slices = lambda nodes: slices_at(
-        _views.elevations(views), brdf, basis.degree, basis.directions.dtype, azimuths, nodes, fit, progress
-    )
-    c, error = by_convergence(slices, 32 + basis.degree, quadrature, tolerance, throw)
-    return Lobes(basis, basis.weights(c), error, brdf.isotropic, domain)
+    dtype, fit = jnp.result_type(brdf.lobe_width), ridge if domain == "upper" else None
+    slices = lambda nodes: slices_at(_views.elevations(views), brdf, degree, dtype, azimuths, nodes, fit, progress)
+    c, error = by_convergence(slices, 32 + degree, quadrature, tolerance, throw)
+    return Slices(c, quadrature_error=error, isotropic=brdf.isotropic, domain=domain)
 
 
 def by_convergence(
@@ -312,7 +170,7 @@ def _project(
         still = jax.lax.stop_gradient(fine)
         seen = [less - least, still - less, still]
         if ridge is not None:
-            modes, shares = _hemisphere_modes(degree)  # the norm of fits above the horizon
+            modes, shares = hemisphere_modes(degree)  # the norm of fits above the horizon
             scale = jnp.asarray(modes * (np.sqrt(shares) / (shares + ridge))[None], view.dtype)
             seen = [x @ scale for x in seen]
         return fine, jnp.stack([jnp.sum(x * x, axis=-1) for x in seen])
@@ -335,38 +193,6 @@ def _as_table(
     error = jnp.maximum(2 * safe_sqrt(jnp.max(square)), 8 * float(jnp.finfo(c.dtype).eps))  # at least the rounding
     c = jnp.moveaxis(c.reshape(*views, *c.shape[1:]), range(len(views)), range(-1 - len(views), -1))  # colour first
     return (c if ridge is None else fit_above(c, ridge)), error
-
-
-def fit_above(c: Float[Array, "*batch n"], ridge: float) -> Float[Array, "*batch n"]:
-    """Expansions that fit functions above the horizon, from projections of these functions, which vanish below it."""
-    modes, shares = _hemisphere_modes(_checks.degree_of(c.shape[-1]))
-    modes = jnp.asarray(modes, c.dtype)
-    return ((c @ modes) * jnp.asarray(1 / (shares + ridge), c.dtype).reshape((1,) * (c.ndim - 1) + (-1,))) @ modes.T
-
-
-@functools.cache
-def _hemisphere_modes(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal expansions [n, n], in columns, orthogonal on the upper hemisphere too, and their shares of it.
-
-    The eigenvectors of the matrix H of integrals of y_i y_j above the horizon, one block for every order m. With b the
-    projection of a function that vanishes below, the least squares fit above, regularised, is (H + ridge)^-1 b.
-    """
-    modes, shares = np.zeros(((degree + 1) ** 2,) * 2), np.zeros((degree + 1) ** 2)
-    blocks = hemisphere_blocks(degree)
-    for m in range(-degree, degree + 1):
-        l = np.arange(abs(m), degree + 1)
-        values, vectors = np.linalg.eigh(blocks[abs(m)])
-        modes[np.ix_(l * l + l + m, l * l + l + m)] = vectors
-        shares[l * l + l + m] = np.maximum(values, 0)
-    return modes, shares
-
-
-@functools.cache
-def hemisphere_blocks(degree: int) -> list[np.ndarray]:
-    """For every order m, integrals above the horizon of products of y_l^m, rows and columns l = m ... degree."""
-    z, weight = _unit_gauss(degree + 1)
-    p = associated_legendre(np.arccos(z), degree)  # a product of two of one order is a polynomial of z
-    return [2 * np.pi * (p[m:, m] * weight) @ p[m:, m].T for m in range(degree + 1)]
 
 
 def project_slice(
@@ -395,7 +221,7 @@ def _nodes(
     x, y = view[0] / sin_o, view[1] / sin_o
     mirror = jnp.stack([-view[0], -view[1], cos_o])
     up, side = jnp.stack([x * cos_o, y * cos_o, sin_o]), jnp.stack([-y, x, jnp.zeros_like(x)])
-    node, gauss = _unit_gauss(quadrature // 2)
+    node, gauss = unit_gauss(quadrature // 2)
     node, gauss = jnp.asarray(node, view.dtype), jnp.asarray(gauss, view.dtype)
     scale = jnp.arcsinh(np.pi / 4 / cos_o)
     offset, rate = cos_o * jnp.sinh(node * scale), cos_o * scale * jnp.cosh(node * scale) * gauss
@@ -403,17 +229,10 @@ def _nodes(
     chi = jnp.concatenate([p for end in ends for p in (end + offset, end + np.pi / 2 - offset)])
     d_chi = jnp.tile(rate, 2 * len(ends)) * (2 if half else 1)
     psi_max = jnp.arctan2(cos_o, -sin_o * jnp.cos(chi))
-    node, gauss = (jnp.asarray(g[None, :], view.dtype) for g in _unit_gauss(quadrature))
+    node, gauss = (jnp.asarray(g[None, :], view.dtype) for g in unit_gauss(quadrature))
     s_max = jnp.arcsinh(psi_max / width)[:, None]
     psi = width * jnp.sinh(node * s_max)
     solid_angle = jnp.sin(psi) * width * jnp.cosh(node * s_max) * s_max * gauss * d_chi[:, None]
     ring = jnp.cos(chi)[:, None] * up[None, :] + jnp.sin(chi)[:, None] * side[None, :]
     w = jnp.cos(psi)[..., None] * mirror[None, None, :] + jnp.sin(psi)[..., None] * ring[:, None, :]
     return w.reshape(-1, 3), solid_angle.reshape(-1)
-
-
-@functools.cache
-def _unit_gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on [0, 1]."""
-    node, weight = np.polynomial.legendre.leggauss(count)
-    return (node + 1) / 2, weight / 2
