@@ -57,7 +57,7 @@ def test_it_is_the_integral_of_the_slice_over_the_cap(dtype, rng):
     lobes = random_slices(DEGREE, dtype)
     node = 5
     view = np.array([np.sin(_views.elevations(VIEWS)[node]), 0, np.cos(_views.elevations(VIEWS)[node])])
-    c = np.asarray(lobes.coefficients()[node], float)
+    c = np.asarray(lobes.coefficients[node], float)
     to_center, radii, expected = [], (0.02, 0.5, 1.0, 1.99), []
     for radius in radii:
         to_center.append(2 * unit(rng.normal(size=3) + [0, 0, 0.5]))

@@ -50,7 +50,7 @@ def test_splines_follow_functions_of_the_elevation():
 
 def test_the_stated_error_is_that_of_the_table():
     table, exact = tabulate(), slices()
-    left = np.asarray(table.coefficients(), float) - exact
+    left = np.asarray(table.coefficients, float) - exact
     shares = np.sin(2 * ELEVATIONS)
     rms = lambda c: np.sqrt(shares @ np.sum(c**2, axis=1))
     error, stated = rms(left) / rms(exact), float(table.quadrature_error)
