@@ -19,7 +19,7 @@ import numpy as np
 from relight import gold_metallic_paint, load_map
 from tqdm import tqdm
 
-from shisd import decomposition, harmonics, io, models, plotting, reference, shading
+from shisd import harmonics, io, models, plotting, reference, shading
 
 BOX = np.array([[-3.0, 0.0, 0.0], [3.0, 6.0, 3.0]])
 EYE, TARGET = np.array([0.4, 0.25, 1.55]), np.array([-0.15, 4.0, 0.75])
@@ -105,10 +105,7 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
     coefficients = np.asarray(outside.coefficients(12))
     expansion = lambda w: harmonics.evaluate(coefficients, w[:, None])
 
-    lobes = {}
-    for name, degree in DEGREES.items():
-        basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-        lobes[name] = shading.tabulate_brdf(brdfs[name], basis, domain="upper")
+    slices = {name: shading.tabulate_brdf(brdfs[name], degree, domain="upper") for name, degree in DEGREES.items()}
 
     images, truths, rows = {}, {}, []
     names = [*lights(), "window"]
@@ -125,7 +122,7 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
                 light = models.PolygonLight(corners.astype(np.float32), emission.astype(np.float32))
                 shade = shading.shade_polygon
             judge = functools.partial(reference.shade_polygon_quadrature, brdfs[surface], corners)
-            image[mask], seconds = timed(functools.partial(shade, lobes[surface], light), *points)
+            image[mask], seconds = timed(functools.partial(shade, slices[surface], light), *points)
             start = time.perf_counter()
             truth[mask] = judge(emission, *points, nodes=nodes)
             reference_seconds = time.perf_counter() - start

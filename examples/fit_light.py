@@ -22,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from shisd import decomposition, io, models, shading
+from shisd import io, models, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 LIGHT_DEGREE = 3
-DEGREE = 12  # of the lobes over the lamp: with 16, the picture moves by less than its noise
+DEGREE = 12  # of the slices over the lamp: with 16, the picture moves by less than its noise
 MISFIT = 0.02  # of the picture's RMS: what worse fits leave is no noise, but the wrong valley
 STARTS = np.array([[x, y, z] for x in (-2, 0, 2) for y in (-2, 0, 2) for z in (1.5, 3.0)])
 
@@ -45,21 +45,18 @@ def chain(picture: _fit.Picture) -> Callable:
     known = {name: jnp.asarray(picture.known[name]) for name in ("alpha", "albedo", "specular", "outline")}
     material = _fit.Coated(known["alpha"], known["albedo"], known["specular"])
     points, views = jnp.asarray(picture.points), jnp.asarray(picture.views)
-    basis = lambda degree: decomposition.RotatedZonalBasis(
-        jnp.asarray(decomposition.optimized_directions(degree)).astype(points.dtype), degree
-    )
-    sky_lobes = shading.tabulate_brdf(material, basis(LIGHT_DEGREE))
-    lamp_lobes = shading.tabulate_brdf(material, basis(DEGREE), domain="upper")
+    sky_slices = shading.tabulate_brdf(material, LIGHT_DEGREE)
+    lamp_slices = shading.tabulate_brdf(material, DEGREE, domain="upper")
     harmonics = jnp.eye((LIGHT_DEGREE + 1) ** 2, dtype=points.dtype)
-    sky = shading.shade_environment(sky_lobes, harmonics, points, views)
+    sky = shading.shade_environment(sky_slices, harmonics, points, views)
 
     portal = models.PortalLight(known["outline"], harmonics)
 
     def images(place: jax.Array) -> jax.Array:
         corners = known["outline"] + place
-        lamp = shading.shade_polygon(lamp_lobes, models.PolygonLight(corners), points, points, views)
+        lamp = shading.shade_polygon(lamp_slices, models.PolygonLight(corners), points, points, views)
         moved = eqx.tree_at(lambda p: p.points, portal, corners)
-        hidden = shading.shade_portal(lamp_lobes, moved, points, points, views)
+        hidden = shading.shade_portal(lamp_slices, moved, points, points, views)
         return jnp.concatenate([sky - hidden, lamp[..., None]], axis=-1).mean(axis=1)
 
     return images

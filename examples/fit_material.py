@@ -1,9 +1,9 @@
 """Find the roughness, anisotropy and colour of a material from one picture of a sphere under a known map.
 
 The picture is Mitsuba's (`examples/data/material.npz`): a brushed gloss on a matt colour, lit by a photographed studio.
-From six parameters to the loss everything is differentiable: BRDF -> slices by view -> spherical harmonics -> weights
-on rotated zonal harmonics -> picture -> loss. The fit starts from a rough, grey, isotropic material, first with lobes
-of degree 8, which is quick, and from there with --degree. It never sees the truth, which is stored for comparison.
+From six parameters to the loss everything is differentiable: BRDF -> slices by view, in spherical harmonics -> picture
+-> loss. The fit starts from a rough, grey, isotropic material, first with slices of degree 8, which is quick, and from
+there with --degree. It never sees the truth, which is stored for comparison.
 Writes a picture and a table to --output.
 
     python examples/fit_material.py --output output/fit_material
@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, io, models, shading
+from shisd import io, models, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 NAMES = "alpha along x", "alpha along y", "albedo, red", "albedo, green", "albedo, blue", "specular"
@@ -40,7 +40,6 @@ def material(logarithms: jax.Array) -> _fit.Coated:
 
 def chain(picture: _fit.Picture, environment: models.Environment, degree: int) -> Callable:
     """The picture [N, 3] of the pixels that are used, as a function of the parameters [6]."""
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
     light = environment.coefficients(degree)
     normals, views = (jnp.asarray(a, jnp.float32) for a in (picture.points, picture.views))
     tangents = jnp.stack([-normals[..., 1], normals[..., 0], jnp.zeros_like(normals[..., 0])], axis=-1)
@@ -48,8 +47,8 @@ def chain(picture: _fit.Picture, environment: models.Environment, degree: int) -
 
     def image(parameters: jax.Array) -> jax.Array:
         # The quadrature's own estimate is of the worst slice, next to the horizon, which no pixel shows: not asked for.
-        lobes = shading.tabulate_brdf(material(parameters), basis, **options, throw=False)
-        return shading.shade_environment(lobes, light, normals, views, tangents).mean(axis=1)
+        slices = shading.tabulate_brdf(material(parameters), degree, **options, throw=False)
+        return shading.shade_environment(slices, light, normals, views, tangents).mean(axis=1)
 
     return image
 
@@ -122,7 +121,7 @@ def table(rows: list[_fit.Row], degree: int) -> str:
 def main(arguments: list[str] | None = None) -> None:
     parser = _scene.output_parser(__doc__, "fit_material")
     parser.add_argument("--size", type=int, help="width of the picture in pixels, a divisor of that stored")
-    parser.add_argument("--degree", type=int, default=20, help="of the lobes; the error falls with it")
+    parser.add_argument("--degree", type=int, default=20, help="of the slices; the error falls with it")
     parser.add_argument("--steps", type=int, default=30, help="most steps of one fit at one degree")
     parser.add_argument("--noisy", type=int, default=2, help="fits to pictures with noise")
     options = parser.parse_args(arguments)

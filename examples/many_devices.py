@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from shisd import decomposition, io, models, shading
+from shisd import io, models, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
@@ -36,13 +36,9 @@ TOLERANCE = {"radiance": 1e-6, "light": 1e-5, "normals": 1e-5}  # rounding, rela
 REPEATS = 5
 
 
-def material() -> models.AbstractBrdf:
-    return models.CookTorrance(roughness=0.45, metallic=1.0, albedo=np.array([0.95, 0.64, 0.54]))
-
-
-def tabulate(degree: int) -> shading.Lobes:
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-    return shading.tabulate_brdf(material(), basis)
+def tabulate(degree: int) -> shading.Slices:
+    copper = models.CookTorrance(roughness=0.45, metallic=1.0, albedo=np.array([0.95, 0.64, 0.54]))
+    return shading.tabulate_brdf(copper, degree)
 
 
 def make_scene(path: Path, degree: int, pixels: int) -> None:
@@ -50,12 +46,12 @@ def make_scene(path: Path, degree: int, pixels: int) -> None:
     rng = np.random.default_rng(0)
     normals, views = (_scene.unit(rng.normal(size=(pixels, 3))) for _ in range(2))
     views *= np.sign(np.sum(normals * views, axis=1, keepdims=True))
-    weights = np.asarray(tabulate(degree).weights)
-    np.savez(path, light=light, weights=weights, normals=normals.astype(np.float32), views=views.astype(np.float32))
+    slices = np.asarray(tabulate(degree).coefficients)
+    np.savez(path, light=light, slices=slices, normals=normals.astype(np.float32), views=views.astype(np.float32))
 
 
-def loss(light, normals, lobes, views):
-    return jnp.sum(shading.shade_environment(lobes, light, normals, views) ** 2)
+def loss(light, normals, material, views):
+    return jnp.sum(shading.shade_environment(material, light, normals, views) ** 2)
 
 
 def worker(folder: Path, process: int) -> None:
@@ -69,10 +65,7 @@ def worker(folder: Path, process: int) -> None:
         jax.distributed.initialize(f"localhost:{job['port']}", job["processes"], process)
 
     scene = np.load(folder.parent / "scene.npz")
-    degree = scene["weights"].shape[-2] - 1
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-    lobes = shading.Lobes(basis, jnp.asarray(scene["weights"]), jnp.zeros(()), True)
-    light = jnp.asarray(scene["light"])
+    material, light = shading.Slices(scene["slices"]), jnp.asarray(scene["light"])
 
     mesh = jax.make_mesh((len(jax.devices()),), ("points",), axis_types=(AxisType.Explicit,))
     sharding = NamedSharding(mesh, PartitionSpec("points"))
@@ -83,9 +76,9 @@ def worker(folder: Path, process: int) -> None:
     @functools.cache
     def results(count: int):
         normals, views = shard("normals", count), shard("views", count)
-        forward = jax.jit(shading.shade_environment).lower(lobes, light, normals, views).compile()
-        backward = jax.jit(jax.grad(loss, (0, 1))).lower(light, normals, lobes, views).compile()
-        return lambda: forward(lobes, light, normals, views), lambda: backward(light, normals, lobes, views)
+        forward = jax.jit(shading.shade_environment).lower(material, light, normals, views).compile()
+        backward = jax.jit(jax.grad(loss, (0, 1))).lower(light, normals, material, views).compile()
+        return lambda: forward(material, light, normals, views), lambda: backward(light, normals, material, views)
 
     start = time.perf_counter()
     forward, backward = results(len(scene["normals"]))
@@ -197,16 +190,15 @@ def table(rows: list[dict], degree: int, pixels: int) -> str:
 def sizes() -> str:
     """What every device holds and what a step of a fit sends, from the shapes of what the package makes."""
     lines = [
-        "| degree | weights of a material | its look-up table | light | all-reduce, light | light and material |",
+        "| degree | slices of a material | its look-up table | light | all-reduce, light | light and material |",
         "|---|---|---|---|---|---|",
     ]
     show = lambda count: f"{count / 1000:.3g} kB" if count < 1e6 else f"{count / 1e6:.3g} MB"
     for degree in (8, 16, 30):
-        lobes = eqx.filter_eval_shape(tabulate, degree)
-        weights, directions = (4 * x.size for x in (lobes.weights, lobes.basis.directions))  # float32
-        light = 4 * 3 * (degree + 1) ** 2
-        look_up = light * (lobes.weights.shape[-3] + 4)  # splines over the views have 4 more coefficients
-        cells = weights, look_up, light, light, light + weights + directions
+        coefficients = eqx.filter_eval_shape(tabulate, degree).coefficients
+        slices, light = 4 * coefficients.size, 4 * 3 * (degree + 1) ** 2  # float32
+        look_up = light * (coefficients.shape[-2] + 4)  # splines over the views have 4 more coefficients
+        cells = slices, look_up, light, light, light + slices
         lines.append(f"| {degree} | {' | '.join(map(show, cells))} |")
     return "\n".join(lines)
 

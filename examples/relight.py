@@ -22,7 +22,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from shisd import decomposition, io, models, plotting, reference, shading
+from shisd import io, models, plotting, reference, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 DEGREES = (4, 8, 16, 30)
@@ -117,18 +117,16 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
         estimate = reference.shade_environment(brdf, environment, normals, views, key=keys[job], samples=samples)
         return np.asarray(estimate.value, float), np.asarray(estimate.standard_error, float)
 
-    # One table of lobes per material serves every degree: light without high bands does not see those of the lobes.
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(max(degrees)), max(degrees))
-
     with ThreadPoolExecutor(2) as pool:
         truths = dict(zip(jobs, tqdm(pool.map(integrate, jobs), "Monte Carlo", len(jobs)), strict=True))
 
-    lobes = {name: shading.tabulate_brdf(brdf, basis) for name, brdf in tqdm(brdfs.items(), "lobes")}
+    # One table per material serves every degree: light without high bands does not see those of the slices.
+    slices = {name: shading.tabulate_brdf(brdf, max(degrees)) for name, brdf in tqdm(brdfs.items(), "slices")}
     cases = list(itertools.product(brdfs, environments, degrees))
 
     def shade(case):
         material, light, degree = case
-        return shading.shade_environment(lobes[material], coefficients[light, degree], normals, views)
+        return shading.shade_environment(slices[material], coefficients[light, degree], normals, views)
 
     coefficients = {(name, d): environments[name].coefficients(d) for name in environments for d in degrees}
     images, rows = {}, []

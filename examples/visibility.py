@@ -15,7 +15,7 @@ import numpy as np
 from relight import DATA, MAPS, load_map
 from tqdm import tqdm
 
-from shisd import decomposition, io, models, reference, shading
+from shisd import io, models, reference, shading
 
 AZIMUTH, DEGREE, SEEN = 5.0, 16, (4, 12)
 PLASTIC = models.CookTorrance(roughness=0.6, metallic=0.0, albedo=np.array([0.6, 0.3, 0.2]))
@@ -28,8 +28,7 @@ def run(output: Path, size: int, samples: int, rays: int, seed: int) -> list[dic
     starts = (view.positions + off * shape.face_normals[view.triangle]).astype(np.float32)
     visible = lambda p, w: ~shape.ray.intersects_any(p, w)
 
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(DEGREE), DEGREE)
-    lobes = shading.tabulate_brdf(PLASTIC, basis)
+    material = shading.tabulate_brdf(PLASTIC, DEGREE)
     make = lambda degree: models.Visibility.from_mesh(shape.vertices, shape.faces, degree, rays=rays, seed=seed)
     seen = {degree: make(degree) for degree in tqdm(SEEN, "visibility")}
 
@@ -37,10 +36,10 @@ def run(output: Path, size: int, samples: int, rays: int, seed: int) -> list[dic
     for name in tqdm(MAPS, "maps"):
         environment, exposure = load_map(name), MAPS[name][1]
         light = environment.coefficients(DEGREE + max(SEEN))
-        images = {"no occlusion": shading.shade_environment(lobes, light, view.normals, view.views)}
+        images = {"no occlusion": shading.shade_environment(material, light, view.normals, view.views)}
         for degree, v in seen.items():
             images[f"degree {degree}"] = shading.shade_environment_visibility(
-                lobes, light, v, view.normals, view.views, **where
+                material, light, v, view.normals, view.views, **where
             )
         truth = reference.shade_environment(
             PLASTIC, environment, view.normals, view.views,

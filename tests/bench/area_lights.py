@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
-from shisd.shading._lobes import lookup_table
 
 from shisd._numerics import dot
 from shisd.domains._integrate import loop_coefficients, zonal_inverse
 from shisd.domains._polygon import clip, loop_solid_angle, on_sphere
 from shisd.harmonics import _tables, sh_basis
 from shisd.shading import _views
+from shisd.shading.slices._slices import lookup_table
 from tests.bench import sh_rotation
 from tests.bench.polygons import line_coefficients
 
@@ -375,7 +375,7 @@ def _faces(corners: list):
 
 
 class Slices(NamedTuple):
-    """A material's slices for `shading._lobes.lookup_table`: splines in elevation of the coefficients with m >= 0."""
+    """What `lookup_table` makes of a material's slices: splines in elevation of the coefficients with m >= 0."""
 
     table: jax.Array
 
@@ -386,8 +386,8 @@ class Slices(NamedTuple):
         return jnp.where(jnp.asarray(order > 0)[:, None], scene.sine * c, c)
 
 
-def slices(lobes) -> Slices:
-    return Slices(lookup_table(lobes)[_even(lobes.degree)])
+def slices(material) -> Slices:
+    return Slices(lookup_table(material)[_even(material.degree)])
 
 
 @functools.cache

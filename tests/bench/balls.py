@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, models, shading
+from shisd import models, shading
 from shisd.models import SphereLight
 from shisd.models._light import versine
 from tests.bench.area_lights import lattice
@@ -72,9 +72,8 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             light = SphereLight(center.astype(np.float32), radius)
             methods = {}
             for degree in (8, 16):
-                basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-                lobes = shading.tabulate_brdf(brdf, basis)
-                shade = functools.partial(shading.shade_sphere, lobes, light, positions, normals, views)
+                material = shading.tabulate_brdf(brdf, degree)
+                shade = functools.partial(shading.shade_sphere, material, light, positions, normals, views)
                 methods[f"zonal light, degree {degree}"] = shade
             for count in (16, 64):
                 uv, weight = lattice(count).astype(np.float32), np.full(count, 1 / count, np.float32)

@@ -12,9 +12,9 @@ from collections.abc import Callable, Hashable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from shisd.shading._lobes import project_slice
 
-from shisd import decomposition, models, shading
+from shisd import models, shading
+from shisd.shading.slices._tabulate import project_slice
 from tests.bench.timing import interleaved
 
 COUNT = 16384
@@ -47,7 +47,7 @@ def slices(brdf: models.AbstractBrdf, degree: int, theta: np.ndarray) -> tuple[n
     return np.asarray(c, float), np.asarray(squares, float)
 
 
-def _verb(material: shading.Lobes | shading.BrdfMatrix):
+def _verb(material: shading.Slices | shading.BrdfMatrix):
     return shading.shade_matrix if isinstance(material, shading.BrdfMatrix) else shading.shade_environment
 
 
@@ -64,7 +64,6 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     local = jnp.asarray(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1), jnp.float32)
     rows = []
     for degree in (8, 16):
-        basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
         light = jnp.asarray(rng.normal(size=(3, (degree + 1) ** 2)), jnp.float32)
         for name, brdf in MATERIALS.items():
             if degree > 8 and not brdf.isotropic:
@@ -73,7 +72,7 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             total = share @ squares
             beyond = float(np.sqrt(max(1 - share @ np.sum(c**2, axis=1) / total, 0)))
             times = []
-            made = {f"table, {v} views": shading.tabulate_brdf(brdf, basis, views=v) for v in TABLES}
+            made = {f"table, {v} views": shading.tabulate_brdf(brdf, degree, views=v) for v in TABLES}
             made |= {f"matrix, view degree {v}": shading.project_brdf(brdf, degree, view_degree=v) for v in MATRICES}
             if name in TIMED:
                 shade: dict[Hashable, Callable] = {
@@ -84,8 +83,8 @@ def tables(quick: bool) -> dict[str, list[dict]]:
                 }
                 times = [interleaved(f, views, seconds=0.3) for f in (shade, slope)]
             for key, m in made.items():
-                got = np.asarray(jax.jit(jax.vmap(m.slice_coefficients))(local), float)
-                arrays = m.blocks if isinstance(m, shading.BrdfMatrix) else [m.weights]
+                got = np.asarray(jax.jit(jax.vmap(m.at))(local), float)
+                arrays = m.blocks if isinstance(m, shading.BrdfMatrix) else [m.coefficients]
                 row = {
                     "material": name,
                     "degree": degree,

@@ -120,26 +120,15 @@ def coefficients(name: str):
 
 @functools.cache
 def tables(material: str):
-    """Lobes by degree, and the seconds of the highest one's table."""
-    bases = {}
-    for degree in (2, *DEGREES):
-        directions = jnp.asarray(decomposition.optimized_directions(degree), jnp.float32)
-        bases[degree] = decomposition.RotatedZonalBasis(directions, degree)
-    brdf, most = MATERIALS[material], bases[DEGREES[-1]]
+    """Slices by degree, and the seconds of the highest one's table."""
+    brdf, most = MATERIALS[material], DEGREES[-1]
     kind = type(brdf).__name__
     table, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64), kind)
-    return {degree: _cut(table, basis) for degree, basis in bases.items()}, seconds
-
-
-@eqx.filter_jit
-def _cut(table, basis):
-    """A table on a basis of lower degree."""
-    c = table.coefficients()[..., : (basis.degree + 1) ** 2]
-    return shading.Lobes(basis, basis.weights(c), table.quadrature_error, True)
+    return {degree: shading.Slices(table.coefficients[..., : (degree + 1) ** 2]) for degree in (2, *DEGREES)}, seconds
 
 
 def shade(parameters, normals, views):
-    return shading.shade_environment(parameters["lobes"], parameters["light"], normals, views)
+    return shading.shade_environment(parameters["material"], parameters["light"], normals, views)
 
 
 def shade_diffuse(parameters, normals, views):
@@ -153,12 +142,12 @@ def shisd(scene: Scene) -> list[Method]:
     own = {"setup": seconds + projection, "ours": True}
     methods = []
     for degree in scene.some(DEGREES) if scene.glossy else (2, *scene.some(DEGREES)):
-        parameters = {"lobes": by_degree[degree], "light": light[:, : (degree + 1) ** 2]}
+        parameters = {"material": by_degree[degree], "light": light[:, : (degree + 1) ** 2]}
         forward, gradient = functions(shade, "light")
         methods.append(Method("shisd", f"degree {degree}", forward, parameters, gradient, **own))
     if not scene.glossy:
         for degree in (2, 4, 8):
-            zonal = by_degree[degree].slice_coefficients(jnp.asarray([0.0, 0.0, 1.0], jnp.float32))
+            zonal = by_degree[degree].at(jnp.asarray([0.0, 0.0, 1.0], jnp.float32))
             zonal = zonal[:, np.arange(degree + 1) * np.arange(1, degree + 2)]
             parameters = {"light": light[:, : (degree + 1) ** 2], "zonal": zonal}
             forward, gradient = functions(shade_diffuse, "light")
@@ -168,10 +157,9 @@ def shisd(scene: Scene) -> list[Method]:
 
 @functools.cache
 def sharp_table(material: str, degree: int):
-    """Lobes of a higher degree, and seconds."""
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
+    """Slices of a higher degree, and seconds."""
     brdf = MATERIALS[material]
-    return timed(lambda: shading.tabulate_brdf(brdf, basis, quadrature=64 + degree), f"{type(brdf).__name__} {degree}")
+    return timed(lambda: shading.tabulate_brdf(brdf, degree, quadrature=64 + degree), f"{type(brdf).__name__} {degree}")
 
 
 def shade_prefiltered(parameters, normals, views):
@@ -182,11 +170,11 @@ def shade_prefiltered(parameters, normals, views):
 def prefiltered(scene: Scene) -> list[Method]:
     methods = []
     for degree in (30,) if scene.quick or scene.material != "GGX 0.1" else (30, 64):
-        lobes, seconds = sharp_table(scene.material, degree)
+        material, seconds = sharp_table(scene.material, degree)
         light = coefficients(scene.map)[0][:, : (degree + 1) ** 2]
         tolerances = (0.1, 0.05, 0.02, 0.005) if degree == 30 else (0.01,)
         for tolerance in scene.some(tolerances if scene.glossy else (0.01,)):
-            make = functools.partial(shading.prefilter, lobes, light, tolerance=tolerance)
+            make = functools.partial(shading.prefilter, material, light, tolerance=tolerance)
             make()  # compiles, for every number of channels again
             filtered, filtering = timed(make, "prefilter")
             parameters = {"filtered": filtered, "maps": filtered.maps}
@@ -248,7 +236,7 @@ def slices(material: str):
 
 @eqx.filter_jit
 def _slices(table, local):
-    return jax.vmap(table.slice_coefficients)(local)
+    return jax.vmap(table.at)(local)
 
 
 def rotations(scene: Scene) -> list[Method]:

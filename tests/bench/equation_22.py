@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import harmonics, shading
-from shisd.shading import _lobes
+from shisd.shading.slices._tabulate import project_slice
 
 BANDS = harmonics._tables.bands
 
@@ -34,14 +34,14 @@ def interpolated_weights(weights, theta):
     return (1 - t) * weights[lower] + t * weights[lower + 1]
 
 
-def literal(lobes, light):
-    degree = lobes.degree
+def literal(basis, table, light):
+    degree = basis.degree
     convolved = light * jnp.asarray(np.sqrt(4 * np.pi / (2 * BANDS(degree) + 1)), light.dtype)
 
     def pixel(normal, view):
         frame, theta = local_frames(normal, view)
-        y = harmonics.sh_basis(lobes.basis.directions @ frame.T, degree)  # [K, n]
-        weights = interpolated_weights(lobes.weights, theta)
+        y = harmonics.sh_basis(basis.directions @ frame.T, degree)  # [K, n]
+        weights = interpolated_weights(table, theta)
         total = 0.0
         for l in range(degree + 1):
             band = slice(l * l, (l + 1) ** 2)
@@ -51,8 +51,8 @@ def literal(lobes, light):
     return pixel
 
 
-def tables(lobes, light, height):
-    degree = lobes.degree
+def tables(basis, table, light, height):
+    degree = basis.degree
     scale = np.sqrt(4 * np.pi / (2 * np.arange(degree + 1) + 1))
     split = light[:, None, :] * jnp.asarray(
         (BANDS(degree) == np.arange(degree + 1)[:, None]) * scale[:, None], light.dtype
@@ -63,7 +63,7 @@ def tables(lobes, light, height):
 
     def pixel(normal, view):
         frame, theta = local_frames(normal, view)
-        d = lobes.basis.directions @ frame.T
+        d = basis.directions @ frame.T
         polar = jnp.arctan2(jnp.hypot(d[:, 0], d[:, 1]), d[:, 2]) * height / np.pi + 0.5
         azimuth = (jnp.arctan2(d[:, 1], d[:, 0]) * height / np.pi - 0.5) % (2 * height)
         j, i = jnp.clip(polar.astype(int), 0, height), jnp.clip(azimuth.astype(int), 0, 2 * height - 1)
@@ -71,21 +71,22 @@ def tables(lobes, light, height):
         value = (1 - u) * ((1 - v) * maps[j, i] + v * maps[j, i + 1]) + u * (
             (1 - v) * maps[j + 1, i] + v * maps[j + 1, i + 1]
         )
-        weights = interpolated_weights(lobes.weights, theta)
+        weights = interpolated_weights(table, theta)
         return jnp.einsum("kcl,lk->c", value.reshape(-1, 3, degree + 1), weights)
 
     return pixel
 
 
-def methods(lobes, light):
+def methods(material, basis, light):
     """name -> jitted function of (normals, views) [N, 3] -> [N, 3]."""
-    exact, lookup = literal(lobes, light), tables(lobes, light, 8 * (lobes.degree + 1))
+    table = material.weights(basis)
+    exact, lookup = literal(basis, table, light), tables(basis, table, light, 8 * (basis.degree + 1))
     tiled = lambda pixel: jax.jit(lambda n, v: jax.lax.map(lambda nv: pixel(*nv), (n, v), batch_size=64))
     return {
         "literal": jax.jit(jax.vmap(exact)),
         "tiled": tiled(exact),
         "tables": tiled(lookup),
-        "rotated": jax.jit(lambda n, v: shading.shade_environment(lobes, light, n, v)),
+        "rotated": jax.jit(lambda n, v: shading.shade_environment(material, light, n, v)),
     }
 
 
@@ -97,7 +98,7 @@ def exact_slices(brdf, light, normals, views):
         def pixel(normal, view):
             frame, theta = local_frames(normal, view)
             local = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-            c = _lobes.project_slice(brdf, local, jnp.asarray(brdf.lobe_width, float), degree, 32 + degree)
+            c = project_slice(brdf, local, jnp.asarray(brdf.lobe_width, float), degree, 32 + degree)
             return jnp.asarray(light, float) @ harmonics.rotate(c, frame)
 
         return np.asarray(jax.lax.map(lambda nv: pixel(*nv), (jnp.asarray(normals, float), jnp.asarray(views, float))))

@@ -1,6 +1,6 @@
 """Few fitted lobes against the linear projection, ISD15 section 7.2: slices, shaded spheres, and what each costs.
 
-projection: the cosine-weighted slices on rotated zonal harmonics of some degree, `shading.shade_environment`.
+projection: the cosine-weighted slices on harmonics of some degree, `shading.shade_environment`.
 Gaussians: J spherical Gaussians for each view elevation, each started from its neighbour's; the maps are filtered
 beforehand with Gaussians of a ladder of sharpness and looked up trilinearly, as Wang et al. 2009 do.
 profiles: J fitted axes for each elevation, each with a free zonal profile; the maps are filtered beforehand with every
@@ -25,7 +25,8 @@ import numpy as np
 from shisd import decomposition, harmonics, io, models, reference, shading
 from shisd._numerics import normalize
 from shisd.decomposition._kernels import gaussian_zonal
-from shisd.shading import _lobes, _surface, _views
+from shisd.shading import _surface, _views
+from shisd.shading.slices import _tabulate
 from tests.bench.equation_22 import local_frames
 from tests.bench.monte_carlo import arccos, arctan2
 from tests.bench.timing import interleaved, timed
@@ -102,7 +103,7 @@ def sphere_points(rows, columns):
 def slice_samples(brdf, theta, nodes=20):
     """Directions, colours [3, N] and solid angles of the slice of one elevation: graded nodes above, few below."""
     view = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-    w, area = _lobes._nodes(view, jnp.asarray(brdf.lobe_width, view.dtype), nodes, half=False)
+    w, area = _tabulate._nodes(view, jnp.asarray(brdf.lobe_width, view.dtype), nodes, half=False)
     with jax.ensure_compile_time_eval():
         below, area_below = harmonics.sphere_rule(60, dtype=view.dtype)
         low = np.asarray(below[:, 2]) < 0
@@ -163,8 +164,8 @@ def blended(table, theta):
     return decomposition.ZonalLobes(z, weights)
 
 
-def projected_values(lobes, theta, w):
-    c = lobes.slice_coefficients(jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)]))
+def projected_values(slices, theta, w):
+    c = slices.at(jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)]))
     return jnp.stack([harmonics.evaluate(colour, w) for colour in c])
 
 
@@ -311,26 +312,24 @@ def sparse_table(brdf, degree, count):
 
     def choose(theta):
         view = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-        c = _lobes.project_slice(brdf, view, width, degree, 48)
+        c = _tabulate.project_slice(brdf, view, width, degree, 48)
         weights, axes = decomposition.sparse_weights(basis, c, count)
         return decomposition.ZonalLobes(basis.directions[axes], weights[..., axes])
 
     return jax.lax.map(choose, jnp.asarray(_views.elevations(VIEWS), jnp.float32))
 
 
-def methods(brdf, bases):
+def methods(brdf):
     """name -> (table, seconds to make it, how to take its values, how to shade with it under a light)."""
     made = {}
-    most = bases[DEGREES[-1]]
+    most = DEGREES[-1]
     exact, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64, throw=False))
-    c = exact.coefficients()
-    shade = lambda lobes, light, n, v: shading.shade_environment(
-        lobes, light["coefficients"][:, : (lobes.degree + 1) ** 2], n, v
+    shade = lambda slices, light, n, v: shading.shade_environment(
+        slices, light["coefficients"][:, : (slices.degree + 1) ** 2], n, v
     )
-    for degree, basis in bases.items():
-        weights = basis.weights(c[..., : (degree + 1) ** 2])
-        lobes = shading.Lobes(basis, weights, exact.quadrature_error, True)
-        made[f"projection, degree {degree}"] = lobes, seconds, projected_values, shade
+    for degree in DEGREES:
+        slices = shading.Slices(exact.coefficients[..., : (degree + 1) ** 2])
+        made[f"projection, degree {degree}"] = slices, seconds, projected_values, shade
     shade = lambda table, light, n, v: shade_gaussians(table, light["pyramid"], n, v)
     for count in (1, 3, 7):
         table, seconds = timed(lambda count=count: fit_table(brdf, count))
@@ -356,8 +355,6 @@ def compare():
     Times: medians over the materials. Slices: RMS over view elevations to 80 degrees. Pictures: RMSE over RMS, against
     quadrature over every texel.
     """
-    axes = {degree: decomposition.optimized_directions(degree) for degree in DEGREES}
-    bases = {degree: decomposition.RotatedZonalBasis(z, degree) for degree, z in axes.items()}
     lights = {}
     for name in MAPS:
         environment = load_map(name)
@@ -375,7 +372,7 @@ def compare():
             name: np.asarray(reference.shade_environment_quadrature(brdf, light["environment"], *few, supersampling=1))
             for name, light in lights.items()
         }
-        made = methods(brdf, bases)
+        made = methods(brdf)
         shades = {
             method: lambda n, v, table=table, shade=shade: shade(table, lights["interior"], n, v)
             for method, (table, _, _, shade) in made.items()

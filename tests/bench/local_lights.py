@@ -3,11 +3,11 @@
 Scenes, float32, 16,384 points: a floor with slightly varied normals, views to 80 degrees from them, below a panel
 ("floor") or beside a screen that stands on it, from 0.1 of its height on ("wall").
 
-Families (kernels and their sources: `area_lights`): ours, `shade_polygon` with lobes fitted above the horizon; Gauss
+Families (kernels and their sources: `area_lights`): ours, `shade_polygon` with slices fitted above the horizon; Gauss
 points on the light; Monte Carlo by solid angle, by the material, by both, all with shifted lattices; linearly
 transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the light by Xu et al.'s rule; the
 light's harmonics, turned to the local frame; axial moments. Points and samples of a portal look the distant light up in
-a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the lobes' degree.
+a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the slices' degree.
 Derivatives are measured in the full run, in one polygon task, as their cost depends on no numbers: of ours, points and
 samples of the light and transformed cosines; for projections of ours and of points. Those of points and samples are of
 the sum as it stands, without what happens where the light crosses the horizon, and by JAX's reverse mode, which XLA
@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, io, models, reference, shading
+from shisd import harmonics, io, models, reference, shading
 from tests.bench import area_lights, lobes, polygons
 from tests.bench.harness import Method, Task, run
 from tests.truth import scipy_basis, triangle_rule
@@ -84,8 +84,8 @@ def shade_polygon(parameters, quad, *rows):
 
 
 def shade_portal(parameters, quad, *rows):
-    lobes, portal = parameters
-    return shading.shade_portal(lobes, eqx.tree_at(lambda p: p.points, portal, quad), *rows)
+    material, portal = parameters
+    return shading.shade_portal(material, eqx.tree_at(lambda p: p.points, portal, quad), *rows)
 
 
 @functools.cache
@@ -138,9 +138,8 @@ def timed(function, *arguments):
 
 
 @functools.cache
-def fitted_lobes(name: str, degree: int):
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-    return timed(functools.partial(shading.tabulate_brdf, domain="upper"), brdf(name), basis)
+def fitted_slices(name: str, degree: int):
+    return timed(functools.partial(shading.tabulate_brdf, domain="upper"), brdf(name), degree)
 
 
 @functools.cache
@@ -169,7 +168,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
         methods.append(Method(family, setting, forward, parameters, gradient, **more))
 
     for degree in (4, 12) if quick else (4, 6, 8, 12, 20):
-        table, seconds = fitted_lobes(name, degree)
+        table, seconds = fitted_slices(name, degree)
         differentiated = shade_polygon if degree == 8 else None  # compiling a derivative takes 10 s
         add("shisd", f"degree {degree}", shade_polygon, table, differentiated, setup=seconds, ours=True)
     for family, kernel, differentiable in (
@@ -191,7 +190,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
         kernel = shaded(area_lights.gaussians, 4, size=SMALL)
         add("spherical Gaussians", f"{count} for a view", kernel, table, setup=seconds)
     for degree in (4,) if quick else (4, 8, 12):
-        table, seconds = fitted_lobes(name, degree)
+        table, seconds = fitted_slices(name, degree)
         for family, kernel in (("SH rotation", area_lights.turned_harmonics), ("axial moments", area_lights.axial)):
             kernel = shaded(kernel, degree, size=128)
             add(family, f"degree {degree}", kernel, area_lights.slices(table), setup=seconds)
@@ -210,7 +209,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
 def portal_task(name: str, stored) -> Task:
     coefficients, methods = stored["portal light"], []
     for degree in (4, 12):
-        table, seconds = fitted_lobes(name, degree)
+        table, seconds = fitted_slices(name, degree)
         light, more = timed(models.PortalLight, QUADS["floor"], coefficients)
         parameters = table, light
         own = Method("shisd", f"degree {degree}", shade_portal, parameters, setup=seconds + more, ours=True)

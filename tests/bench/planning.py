@@ -5,7 +5,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, models, planning, reference, shading
+from shisd import models, planning, reference, shading
 from tests.bench.lobes import load_map
 from tests.bench.timing import interleaved
 from tests.models.materials import GOLD_PAINT
@@ -68,13 +68,12 @@ def truth_of(brdf, light, where):
 
 def general(brdf, light, degree, views=64):
     """A function of pixels: one light by the path that always works."""
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
     if isinstance(light, models.PolygonLight):
-        lobes = shading.tabulate_brdf(brdf, basis, views=views, domain="upper", throw=False)
-        return lambda p, n, v: shading.shade_polygon(lobes, light, p, n, v)
-    lobes = shading.tabulate_brdf(brdf, basis, views=views, throw=False)
+        material = shading.tabulate_brdf(brdf, degree, views=views, domain="upper", throw=False)
+        return lambda p, n, v: shading.shade_polygon(material, light, p, n, v)
+    material = shading.tabulate_brdf(brdf, degree, views=views, throw=False)
     e = light.coefficients(degree) if isinstance(light, models.Environment) else light
-    return lambda p, n, v: shading.shade_environment(lobes, e, n, v)
+    return lambda p, n, v: shading.shade_environment(material, e, n, v)
 
 
 def bench_prediction(degrees=(4, 8, 16), count=1024, names=("interior", "studio")):

@@ -11,7 +11,7 @@ plane within the measured function, and all 128 x 128 of them are shaded, also t
 
 Judged are pixels that lie wholly on the surface and, on the sphere, face the camera by a cosine of 0.25 or more: at the
 edge, a pixel's mean and its centre are different things. Every fourth one either way has a reference: Mitsuba's own
-mean of very many samples, whose error is the spread of its passes. Setup: for ours, lobes and coefficients of the map,
+mean of very many samples, whose error is the spread of its passes. Setup: for ours, slices and coefficients of the map,
 with compiling; for Mitsuba, loading the scene. Mitsuba's first call is short where its cache on disk has the kernel.
 """
 
@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from shisd import decomposition, io, models, shading
+from shisd import io, models, shading
 from tests.bench import make_pictures
 from tests.bench.harness import Method, Task
 
@@ -185,33 +185,32 @@ def room() -> models.Environment:
 def ours(name: str, degree: int, rays) -> Method:
     domain = "sphere" if name == "sphere" else "upper"
     start = time.perf_counter()
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-    lobes = shading.tabulate_brdf(models.Ggx(ALPHA), basis, domain=domain)
+    material = shading.tabulate_brdf(models.Ggx(ALPHA), degree, domain=domain)
     light = room().coefficients(degree) if name == "sphere" else models.PolygonLight(LAMP, EMISSION)
-    jax.block_until_ready((lobes, light))
+    jax.block_until_ready((material, light))
     setup = time.perf_counter() - start
     shade = _shade_sphere if name == "sphere" else _shade_floor
-    parameters = lobes, light, rays
+    parameters = material, light, rays
     gradient = _gradient(shade) if (name, degree) == ("sphere", DEGREES[0]) else None  # others take long to compile
     return Method("shisd", f"degree {degree}", shade, parameters, gradient, setup, ours=True)
 
 
 def _shade_sphere(parameters):
-    lobes, light, rays = parameters
+    material, light, rays = parameters
     _, normals, views, hit = meet("sphere", rays)
     normals = jnp.where(hit[:, None], normals, views)
-    return jnp.where(hit[:, None], shading.shade_environment(lobes, light, normals, views), 0)
+    return jnp.where(hit[:, None], shading.shade_environment(material, light, normals, views), 0)
 
 
 def _shade_floor(parameters):
-    lobes, light, rays = parameters
+    material, light, rays = parameters
     points, normals, views, _ = meet("floor", rays)
-    return shading.shade_polygon(lobes, light, points, normals, views)
+    return shading.shade_polygon(material, light, points, normals, views)
 
 
 @functools.cache
 def _gradient(shade):
-    """Of the mean of squares, in the weights of the material, the light and the rays."""
+    """Of the mean of squares, in the slices of the material, the light and the rays."""
     return lambda parameters: jax.value_and_grad(lambda p: jnp.mean(shade(p) ** 2))(parameters)
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, models, shading
+from shisd import harmonics, models, shading
 from shisd.domains._integrate import incidence_inverse
 from shisd.harmonics import _pairing
 from tests.bench import local_lights
@@ -94,12 +94,11 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     views = np.where(facing > 0, views, views - 2 * facing * normals)
     light = models.PolygonLight(local_lights.QUADS["wall"])
     for degree in (8, 16, 30):
-        basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
         e = jnp.asarray(np.random.default_rng(1).normal(size=(3, (degree + 1) ** 2)), jnp.float32)
-        fitted = shading.tabulate_brdf(models.Ggx(0.25, 0.04), basis, views=VIEWS, domain="upper")
-        one = shading.tabulate_brdf(models.Ggx(0.25, 0.04), basis, views=VIEWS)
-        rgb = shading.tabulate_brdf(models.Ggx(0.25, np.array([0.9, 0.6, 0.3])), basis, views=VIEWS)
-        shade = lambda lobes, e=e: functools.partial(shading.shade_environment, lobes, e, normals, views)
+        fitted = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, views=VIEWS, domain="upper")
+        one = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, views=VIEWS)
+        rgb = shading.tabulate_brdf(models.Ggx(0.25, np.array([0.9, 0.6, 0.3])), degree, views=VIEWS)
+        shade = lambda m, e=e: functools.partial(shading.shade_environment, m, e, normals, views)
         functions = {
             "shade_environment, one colour": (shade(one), environment_work(degree, 1)),
             "shade_environment, RGB material": (shade(rgb), environment_work(degree, 3)),

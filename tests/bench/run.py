@@ -44,11 +44,11 @@ def bench_equation_22(degrees=(4, 8, 16, 30)):
     rows = []
     for degree in degrees:
         basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-        lobes = shading.tabulate_brdf(brdf, basis)
+        material = shading.tabulate_brdf(brdf, degree)
         # a light whose band energies fall like 1/(l+1)^2, as those of measured environments do
         light = rng.normal(size=(3, (degree + 1) ** 2)) / (1 + _tables.bands(degree)) ** 1.5
         light = jnp.asarray(light, jnp.float32)
-        candidates = equation_22.methods(lobes, light)
+        candidates = equation_22.methods(material, basis, light)
         count = PIXELS if degree <= 16 else PIXELS // 8  # the literal form stacks pixels x (2L+1) x (L+1)^2 numbers
         truth = equation_22.exact_slices(brdf, light, normals[:64], views[:64])
         times = interleaved(candidates, normals[:count], views[:count])
@@ -65,7 +65,7 @@ def bench_equation_22(degrees=(4, 8, 16, 30)):
             })  # fmt: skip
         gradient = jax.jit(
             jax.grad(
-                lambda n, v, lobes=lobes, light=light: jnp.sum(shading.shade_environment(lobes, light, n, v)), (0, 1)
+                lambda n, v, m=material, light=light: jnp.sum(shading.shade_environment(m, light, n, v)), (0, 1)
             )
         )
         forward = candidates["rotated"]
@@ -86,11 +86,10 @@ def memory_child(degree):
     status = Path("/proc/self/status")  # not getrusage: its peak starts from that of the parent process
     peak = lambda: int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**20
     normals = unit(rng.normal(size=(1024 * 768, 3))).astype(np.float32)
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
-    lobes = shading.tabulate_brdf(models.Ggx(0.3), basis)
+    material = shading.tabulate_brdf(models.Ggx(0.3), degree)
     light = rng.normal(size=(3, (degree + 1) ** 2)).astype(np.float32)
     before = peak()
-    jax.block_until_ready(shading.shade_environment(lobes, light, normals, normals))
+    jax.block_until_ready(shading.shade_environment(material, light, normals, normals))
     print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
 
 
@@ -201,7 +200,7 @@ def polygon_light_points(count):
 
 
 def bench_ridge(ridges=(1e-2, 1e-4, 1e-6, 1e-8, 1e-10), degree=8, count=64):
-    """Relative RMSE of lobes fitted above the horizon against the ridge of the fit, at degree 8; the same light."""
+    """Relative RMSE of slices fitted above the horizon against the ridge of the fit, at degree 8; the same light."""
     position, view, normal = polygon_light_points(count)
     quad = POLYGON_LIGHT.astype(float)
     rows = [{"ridge": ridge} for ridge in ridges]
@@ -212,12 +211,10 @@ def bench_ridge(ridges=(1e-2, 1e-4, 1e-6, 1e-8, 1e-10), degree=8, count=64):
         for dtype in (np.float32, np.float64):
             points = [x.astype(dtype) for x in (position, normal, view)]
             with jax.enable_x64(dtype == np.float64):
-                axes = decomposition.optimized_directions(degree, dtype=dtype)
-                basis = decomposition.RotatedZonalBasis(axes, degree)
                 light = models.PolygonLight(quad.astype(dtype))
                 for row in rows:
-                    lobes = shading.tabulate_brdf(make(), basis, domain="upper", ridge=row["ridge"])
-                    error = np.asarray(shading.shade_polygon(lobes, light, *points)) - truth
+                    material = shading.tabulate_brdf(make(), degree, domain="upper", ridge=row["ridge"])
+                    error = np.asarray(shading.shade_polygon(material, light, *points)) - truth
                     row[f"{name}, {dtype.__name__}"] = float(np.sqrt(np.mean(error**2) / np.mean(truth**2)))
     return rows
 

@@ -340,14 +340,14 @@ def shading_rows():
     results = {}
     brdf = models.Ggx(0.5, 0.04)
     with jax.enable_x64(True):
-        exact_slice = eqx.filter_jit(tabulated(brdf, np.float64, domain="upper").slice_coefficients)
+        exact_slice = eqx.filter_jit(tabulated(brdf, np.float64, domain="upper").at)
         slice_of = lambda view: exact_slice(jnp.asarray(view))
         expected = {name: polygon_truth(name, scene, slice_of) for name, scene in scenes.items()}
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64):
-            lobes = tabulated(brdf, dtype, domain="upper")
-            shade = lambda points, *surface, lobes=lobes: shading.shade_polygon(
-                lobes, models.PolygonLight(points), *surface
+            material = tabulated(brdf, dtype, domain="upper")
+            shade = lambda points, *surface, material=material: shading.shade_polygon(
+                material, models.PolygonLight(points), *surface
             )
             stacked = [jnp.asarray(np.stack(x), dtype) for x in zip(*scenes.values(), strict=True)]
             got, slopes = jax.jit(jax.vmap(jax.value_and_grad(shade, (0, 1, 2, 3))))(*stacked)
@@ -367,8 +367,8 @@ def shading_rows():
 
 
 def tabulated(brdf, dtype, **options):
-    axes = decomposition.optimized_directions(SHADING_DEGREE, dtype=dtype)
-    return shading.tabulate_brdf(brdf, decomposition.RotatedZonalBasis(axes, SHADING_DEGREE), **options)
+    brdf = jax.tree.map(lambda x: jnp.asarray(x, dtype), brdf)
+    return shading.tabulate_brdf(brdf, SHADING_DEGREE, **options)
 
 
 def polygon_truth(name, scene, slice_of):
@@ -516,7 +516,7 @@ def light_rows():
     clean = np.nan_to_num(hard_cases.BAD_TEXELS, nan=0.0, posinf=65504.0)  # of half precision the largest
     maps = hard_cases.LIGHTS | {"NaN and infinite texels, from a file": clean}
     with jax.enable_x64(True):
-        slice_of = jax.jit(jax.vmap(tabulated(brdf, np.float64).slice_coefficients))
+        slice_of = jax.jit(jax.vmap(tabulated(brdf, np.float64).at))
         local, exact = functools.partial(truth.environment_radiance, slice_of), {}
         for name, texels in maps.items():
             e = truth.map_coefficients(texels, SHADING_DEGREE)
@@ -532,13 +532,13 @@ def light_rows():
     results = {name: [] for name in maps}
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64), tempfile.TemporaryDirectory() as folder:
-            lobes, weights = tabulated(brdf, dtype), jnp.asarray(mix, dtype)
+            material, weights = tabulated(brdf, dtype), jnp.asarray(mix, dtype)
 
             @jax.jit
             @functools.partial(jax.grad, argnums=(0, 1, 2), has_aux=True)
-            def shade(texels, normals, views, lobes=lobes, weights=weights):
+            def shade(texels, normals, views, material=material, weights=weights):
                 light = models.Environment(texels).coefficients(SHADING_DEGREE)
-                radiance = shading.shade_environment(lobes, light, normals, views)
+                radiance = shading.shade_environment(material, light, normals, views)
                 return weights @ radiance, radiance
 
             surface = [jnp.asarray(x, dtype) for x in (normals, views)]

@@ -15,18 +15,18 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from shisd.shading._lobes import lookup_table, slice_values
 
 from examples import _scene
-from shisd import decomposition, harmonics, models, reference, shading
+from shisd import harmonics, models, reference, shading
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
 from shisd.shading._surface import frame
+from shisd.shading.slices._slices import lookup_table, slice_values
 from tests.bench.timing import interleaved
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 MATERIALS = {"clay": models.Lambertian(0.7), "GGX 0.4": models.Ggx(0.4, 0.5)}
-LOBES, DEGREES, FINE = 16, (2, 4, 8, 12), 24
+OF_SLICES, DEGREES, FINE = 16, (2, 4, 8, 12), 24
 
 
 def rabbit(size: int):
@@ -50,13 +50,13 @@ def energies(c: np.ndarray) -> np.ndarray:
     return np.bincount(_tables.bands(degree), np.mean(c.reshape(-1, c.shape[-1]) ** 2, axis=0))
 
 
-def predicted(lobes, e, fine, view, degree: int) -> float:
+def predicted(material, e, fine, view, degree: int) -> float:
     """RMS error of leaving out the bands of visibility above `degree`, averaged over colours."""
     some = np.linspace(0, len(view.normals) - 1, 200).astype(int)
     frames = frame(jnp.asarray(view.normals[some]))
     local = jnp.einsum("pij,pi->pj", frames, view.views[some])
-    slices = slice_values(lookup_table(lobes), local, lobes)
-    slices = rotate_many(slices[:, None], frames, LOBES)[:, 0].T
+    slices = slice_values(lookup_table(material), local, material)
+    slices = rotate_many(slices[:, None], frames, OF_SLICES)[:, 0].T
     products = harmonics.multiply(e[None], slices[:, None], FINE)
     product = energies(np.asarray(products))
     seen = energies(np.asarray(fine.at(view.triangle[some], view.weights[some])))
@@ -67,7 +67,6 @@ def predicted(lobes, e, fine, view, degree: int) -> float:
 def tables(quick: bool) -> dict[str, list[dict]]:
     """Title and rows of the table."""
     shape, view, starts, visible = rabbit(48 if quick else 80)
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(LOBES), LOBES)
     see = lambda degree: models.Visibility.from_mesh(shape.vertices, shape.faces, degree, rays=2048)
     fine, seen = see(FINE), {degree: see(degree) for degree in (DEGREES[1:3] if quick else DEGREES)}
     where = {"triangle": view.triangle, "weights": view.weights}
@@ -75,7 +74,7 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     for map_name, file in (("interior", "interior.hdr"), ("studio", "studio.exr"))[: 1 if quick else 2]:
         light = environment(file)
         for name, brdf in MATERIALS.items():
-            lobes = shading.tabulate_brdf(brdf, basis)
+            material = shading.tabulate_brdf(brdf, OF_SLICES)
             trace = lambda samples, seed, brdf=brdf, light=light: reference.shade_environment(
                 brdf, light, view.normals, view.views, key=jax.random.key(seed), samples=samples, positions=starts,
                 visible=visible,
@@ -83,14 +82,14 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             truth = trace(256 if quick else 1024, 0)
             noise2 = float(np.mean(np.asarray(truth.standard_error, float) ** 2))
             rms = float(np.sqrt(np.mean(np.asarray(truth.value, float) ** 2)))
-            e = {degree: light.coefficients(degree + LOBES) for degree in (0, *seen, FINE)}
+            e = {degree: light.coefficients(degree + OF_SLICES) for degree in (0, *seen, FINE)}
             shaded = {
-                ("no occlusion", ""): lambda lobes=lobes, e=e: shading.shade_environment(
-                    lobes, e[0], view.normals, view.views
+                ("no occlusion", ""): lambda material=material, e=e: shading.shade_environment(
+                    material, e[0], view.normals, view.views
                 ),
                 **{
                     ("visibility", f"degree {degree}"): functools.partial(
-                        shading.shade_environment_visibility, lobes, e[degree], v, view.normals, view.views, **where
+                        shading.shade_environment_visibility, material, e[degree], v, view.normals, view.views, **where
                     )
                     for degree, v in seen.items()
                 },
@@ -100,7 +99,7 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             for (method, setting), function in shaded.items():
                 excess = np.mean((np.asarray(function(), float) - np.asarray(truth.value, float)) ** 2) - noise2
                 expected = method.startswith("visibility") and predicted(
-                    lobes, e[FINE], fine, view, int(setting.split()[1])
+                    material, e[FINE], fine, view, int(setting.split()[1])
                 )
                 rows.append({
                     "map": map_name,
