@@ -26,7 +26,7 @@ MAY_IMPORT = {
     "planning": {"harmonics", "decomposition", "domains", "models", "shading"},
     "filtering": {"harmonics", "decomposition", "models", "io"},
     "plotting": {"harmonics", "models"},
-    "reference": {"models", "domains"},  # classes only
+    "reference": {"models", "domains"},  # their classes only
 }
 FOR_TYPES = {"io": {"models"}}  # under `if TYPE_CHECKING:` alone
 FORBIDDEN = ("jax._src", "equinox.internal", "equinox._")
@@ -153,12 +153,14 @@ def test_what_stands_in_internal(stage):
         ("filtering.py", "from shisd.shading import Lobes"),
         ("io.py", "from shisd.models import AbstractBrdf"),
         ("_numerics.py", "from shisd.harmonics import sh_basis"),
-        ("reference.py", "from shisd.harmonics import sh_basis"),
-        ("reference.py", "from shisd.domains import solid_angle"),
-        ("reference.py", "from shisd.domains._moments import Loop"),
-        ("reference.py", "from shisd.domains.internal import Loop"),
-        ("reference.py", "from shisd import domains"),
-        ("reference.py", "from shisd import shading"),
+        ("reference/_polygon.py", "from shisd.harmonics import sh_basis"),
+        ("reference/_polygon.py", "from shisd.domains import solid_angle"),
+        ("reference/_polygon.py", "from shisd.domains._moments import Loop"),
+        ("reference/_polygon.py", "from shisd.domains.internal import Loop"),
+        ("reference/_polygon.py", "from shisd import domains"),
+        ("reference/_polygon.py", "from shisd import shading"),
+        ("reference/_polygon.py", "from shisd.reference.internal import cumulative"),
+        ("reference/__init__.py", "from shisd.harmonics import sh_basis as sh_basis"),
         ("shading/_lobes.py", "from shisd.models._brdf import Ggx"),
         ("shading/_lobes.py", "from shisd.harmonics import _tables"),
         ("shading/_lobes.py", "import shisd.harmonics._tables"),
@@ -174,14 +176,14 @@ def test_what_stands_in_internal(stage):
         ("shading/_lobes.py", "import shisd.harmonics\nl = shisd.harmonics._tables.bands(3)"),
         ("shading/_lobes.py", "from shisd.harmonics import internal\nl = internal.polar_series(3)"),
         ("harmonics/_sh.py", "from shisd.domains.internal import clip"),
-        ("planning.py", "from shisd.shading._lobes import RIDGE"),
+        ("planning/_paths.py", "from shisd.shading._lobes import RIDGE"),
         ("io.py", "if TYPE_CHECKING:\n    from shisd.models._brdf import AbstractBrdf"),
-        ("planning.py", "from .shading import Lobes"),
-        ("planning.py", "from jax import _src"),
-        ("planning.py", "import jax._src.core as c"),
-        ("planning.py", "from equinox import internal as eqxi"),
-        ("planning.py", "from equinox._module import Module"),
-        ("planning.py", "import equinox as eqx\nloop = eqx.internal.while_loop"),
+        ("planning/_paths.py", "from .shading import Lobes"),
+        ("planning/_paths.py", "from jax import _src"),
+        ("planning/_paths.py", "import jax._src.core as c"),
+        ("planning/_paths.py", "from equinox import internal as eqxi"),
+        ("planning/_paths.py", "from equinox._module import Module"),
+        ("planning/_paths.py", "import equinox as eqx\nloop = eqx.internal.while_loop"),
     ],
 )
 def test_what_no_module_may_import(place, source):
@@ -200,7 +202,12 @@ def test_what_no_module_may_import(place, source):
         ("shading/_lobes.py", "from shisd.harmonics.internal import bands\nfrom shisd.models import Ggx\nGgx.value"),
         ("shading/_lobes.py", "from shisd.harmonics import internal as h\nh.bands(3)\nself.internal.bands"),
         ("io.py", "if TYPE_CHECKING:\n    from shisd.models import AbstractBrdf"),
-        ("reference.py", "from shisd.models import Ggx\nfrom shisd.domains import SphericalPolygon\nGgx.value"),
+        (
+            "reference/_polygon.py",
+            "from shisd.models import Ggx\nfrom shisd.domains import SphericalPolygon\nGgx.value",
+        ),
+        ("reference/_polygon.py", "from shisd import _checks\nfrom shisd.reference._monte_carlo import cumulative"),
+        ("planning/_paths.py", "from shisd.planning._tables import Tables\nfrom shisd.shading.internal import RIDGE"),
         ("__init__.py", "from shisd import planning"),
     ],
 )
@@ -219,6 +226,6 @@ def test_what_no_later_stage_takes_is_found():
     sources = {
         "harmonics/_sh.py": "from shisd.harmonics.internal import own",
         "shading/_lobes.py": "from shisd.harmonics.internal import bands\nfrom shisd.domains.internal import other",
-        "planning.py": "from shisd.harmonics import internal as h\nh.orders(3)",
+        "planning/_paths.py": "from shisd.harmonics import internal as h\nh.orders(3)",
     }
     assert unused("harmonics", {"bands", "orders", "own", "other"}, sources) == {"own", "other"}

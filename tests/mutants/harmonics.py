@@ -3,7 +3,7 @@
 from tests.mutants import Mutant
 
 _SH, _TRANSFORM, _ROTATION = (f"shisd/harmonics/_{name}.py" for name in ("sh", "transform", "rotation"))
-_ENVIRONMENT, _REFERENCE = "shisd/models/_environment.py", "shisd/reference.py"
+_ENVIRONMENT, _REFERENCE = "shisd/models/_environment.py", "shisd/reference/_monte_carlo.py"
 _OF_SH, _OF_TRANSFORM, _OF_ROTATION = (f"tests/harmonics/test_{name}.py" for name in ("sh", "transform", "rotation"))
 _OF_ENVIRONMENT = "tests/models/test_environment.py"
 
