@@ -149,6 +149,13 @@ MUTANTS = [
         test="tests/harmonics/test_windows.py::test_dering_takes_each_expansion_by_itself",
     ),
     Mutant(
+        "ambisonic channels as coefficients of their basis",
+        "shisd/harmonics/_conventions.py",
+        old="np.sqrt(4 * np.pi / (2 * l + 1))",
+        new="np.sqrt((2 * l + 1) / (4 * np.pi))",
+        test="tests/harmonics/test_conventions.py::test_ambisonic_channels_hold_their_sources",
+    ),
+    Mutant(
         "maps of other programs mirrored",
         _ENVIRONMENT,
         old="np.roll(texels[:, ::-1], round(turn * width), axis=1)",
