@@ -9,6 +9,8 @@ import pytest
 from jax.test_util import check_grads
 
 from shisd import harmonics, models, planning, reference, shading
+from shisd.planning._bands import Distant, Material, known_light
+from shisd.planning._prediction import judge
 from tests.hard_cases import unit
 
 LAMP = np.array([[-0.5, -0.5, 1.5], [-0.5, 0.5, 1.5], [0.5, 0.5, 1.5], [0.5, -0.5, 1.5]], np.float32)
@@ -109,7 +111,7 @@ def test_the_axis_of_a_light_is_found(zonal):
     """Also where the light has no first moment, and where it has no axis at all."""
     axis = jnp.asarray(unit([1.0, 2.0, -0.5]), jnp.float32)
     e = harmonics.convolve(harmonics.sh_basis(axis, len(zonal) - 1), jnp.asarray(zonal))
-    light = planning._seen("it", e, None, 4)
+    light = known_light("it", e, None, 4)
     assert np.max(light.off_axis) < 1e-6
     if len(zonal) > 1:
         np.testing.assert_allclose(abs(light.axis @ np.asarray(axis)), 1, rtol=1e-6)
@@ -155,12 +157,12 @@ def test_errors_are_those_of_the_worst_colour(rng):
     """A dim red light of high bands beside a bright blue one of low bands: in the mean of colours red would be lost."""
     slices, shares, e = rng.normal(size=(1, 3, 49)), np.array([0.2, 0.5, 0.3]), np.zeros((3, 49))
     e[0, 0], e[0, 36:], e[2, :4] = 0.01, 0.01, 3.0
-    light = planning._Distant(e, True)
+    light = Distant(e, True)
     energy = shares @ np.add.reduceat(slices[0] ** 2, np.arange(7) ** 2, axis=-1)
     red = energy * [1, 0, 0, 0, 0, 0, 13] / (2 * np.arange(7) + 1)
-    material = planning._Material(slices, shares, False, True, 4)
+    material = Material(slices, shares, False, True, 4)
     for degree, expected in ((5, np.sqrt(red[6] / np.sum(red))), (6, 0.0)):
-        np.testing.assert_allclose(planning._judge(planning.Table, material, light, degree).error, expected, rtol=1e-12)
+        np.testing.assert_allclose(judge(planning.Table, material, light, degree).error, expected, rtol=1e-12)
 
 
 def test_what_cannot_be_met_is_said():

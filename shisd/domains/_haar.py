@@ -18,8 +18,8 @@ from shisd._module import Module
 from shisd._numerics import dot, normalize
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, clip, loop_solid_angle, on_sphere
+from shisd.domains.moments import Loop
 
 
 class HaarBasis(Module):

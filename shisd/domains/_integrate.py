@@ -1,6 +1,6 @@
 """Integrals over regions of the sphere: of zonal functions, of cosine powers, and of any expansion (CSH18 Eq. 1).
 
-An expansion is integrated through zonal functions about shared axes, which are all that `_moments` computes: with K
+An expansion is integrated through zonal functions about shared axes, which are all that `moments` computes: with K
 axes z_k that resolve each band, I_l(z_k) = 4 pi/(2l+1) sum_m y_l^m(z_k) c_l^m determines the integrals c_l^m of the
 basis. The other route, without axes, writes the gradient of r^l y_l^m as harmonics of degree l-1 and integrates those
 along the edges by quadrature (`line_coefficients` in tests/bench). It is smooth to every order and more accurate for
@@ -22,10 +22,9 @@ from shisd._numerics import dot, normalize, same_dtype
 from shisd._typing import Array, ArrayLike, Float
 from shisd.decomposition import fibonacci_directions, optimized_directions
 from shisd.decomposition.internal import TABLE_DEGREE
-from shisd.domains import _moments
-from shisd.domains._moments import Loop
 from shisd.domains._polygon import SphericalPolygon, loop_solid_angle
 from shisd.domains._region import SphericalCap, cap_coefficients, cap_integrals
+from shisd.domains.moments import Loop, fold, moments, powers
 from shisd.harmonics import legendre
 from shisd.harmonics.internal import host_basis
 
@@ -122,14 +121,14 @@ def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "k 
         return cap_integrals(region.versine.astype(d.dtype), degree)[None] * legendre(cosine, degree)
     v, d = same_dtype(region.loop(), d)
     angle = jnp.broadcast_to(loop_solid_angle(v, region.largest)[None, None], (1, d.shape[0], 1))
-    rest = [_moments.moments(d, v, degree)] if degree else []
+    rest = [moments(d, v, degree)] if degree else []
     return jnp.concatenate([angle, *rest])[..., 0].T
 
 
 @eqx.filter_jit
 def _axial_moments(polygon: SphericalPolygon, axes: Array, order: int) -> Float[Array, "k n"]:
     v, d = same_dtype(polygon.loop(), _checked_axes(axes))
-    return _moments.powers(d, v, loop_solid_angle(v, polygon.largest), order)[..., 0].T
+    return powers(d, v, loop_solid_angle(v, polygon.largest), order)[..., 0].T
 
 
 @eqx.filter_jit
@@ -146,7 +145,7 @@ def loop_coefficients(v: Loop, solid_angle: Float[Array, " p"], degree: int) -> 
     if degree == 0:
         return constant
     axes, inverse = zonal_inverse(degree, v.dtype)
-    zonal = _moments.moments(jnp.asarray(axes), v, degree)  # l k p
+    zonal = moments(jnp.asarray(axes), v, degree)  # l k p
     bands = [jnp.asarray(inverse[l]) @ zonal[l - 1] for l in range(1, degree + 1)]
     return jnp.concatenate([constant, *bands])
 
@@ -162,7 +161,7 @@ def fold_expansion(
     for l, matrix in enumerate(inverse):
         weights.append(jnp.asarray(matrix.T / max(l * (l + 1), 1)) @ c[used : used + len(matrix)])
         used += len(matrix)
-    return _moments.fold(jnp.stack(weights, axis=1), jnp.asarray(axes), v, len(inverse) - 1, spare)
+    return fold(jnp.stack(weights, axis=1), jnp.asarray(axes), v, len(inverse) - 1, spare)
 
 
 @functools.cache

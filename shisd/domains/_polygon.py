@@ -1,6 +1,6 @@
 """Spherical polygons: construction, clipping to a hemisphere, solid angle.
 
-The layout inside is that of `_moments`: v[x y z, vertex, p], one loop per point p, unused slots filled by repeating a
+The layout inside is that of `moments`: v[x y z, vertex, p], one loop per point p, unused slots filled by repeating a
 vertex, since edges of no length add nothing to any integral.
 """
 
@@ -13,7 +13,7 @@ from shisd import _checks
 from shisd._module import Module
 from shisd._numerics import arctan2, cross, dot, normalize, same_dtype
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.domains._moments import Loop, sides
+from shisd.domains.moments import Loop, sides
 
 
 class SphericalPolygon(Module):

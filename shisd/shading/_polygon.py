@@ -2,7 +2,7 @@
 
 The light's outline, relative to the point, is cut off at the horizon and projected on the sphere; the material's slice
 is integrated over it exactly. With the slice as weights on zonal functions about shared axes this is one fused sum over
-their moments (`domains._moments.fold`), and nothing per pixel is a matrix.
+their moments (`domains.moments.fold`), and nothing per pixel is a matrix.
 
 Where radiance depends on direction, the integrand is a product. Its matrix M, from the coefficients of a slice to those
 of slice times light, is the same for all points; with b = integrals of the basis over the outline, the radiance is

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import models, planning, reference, shading
+from shisd.planning._bands import known_light, known_material
+from shisd.planning._prediction import judge
 from tests.bench.lobes import load_map
 from tests.bench.timing import interleaved
 from tests.models.materials import GOLD_PAINT
@@ -86,14 +88,14 @@ def bench_prediction(degrees=(4, 8, 16), count=1024, names=("interior", "studio"
     lights = {name: small_map(name) for name in names} | {"lamp": models.PolygonLight(LAMP, np.float32([3, 2, 1]))}
     where = pixels(count)
     reference_degree = 60
-    seen = {name: planning._seen(name, x, jnp.asarray(where[0][::80]), reference_degree) for name, x in lights.items()}
+    seen = {name: known_light(name, x, jnp.asarray(where[0][::80]), reference_degree) for name, x in lights.items()}
     for material, brdf in materials().items():
-        known = planning._material(brdf, reference_degree, 64)
+        known = known_material(brdf, reference_degree, 64)
         for name, light in lights.items():
             truth = truth_of(brdf, light, where)
             path = planning.Polygon if name == "lamp" else planning.Table
             for degree in degrees:
-                judged = planning._judge(path, known, seen[name], degree)
+                judged = judge(path, known, seen[name], degree)
                 measured = relative(general(brdf, light, degree)(*where), truth)
                 rows.append({
                     "material": material,

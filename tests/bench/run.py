@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import decomposition, domains, io, models, reference, shading
-from shisd.domains import _moments
+from shisd.domains.moments import fold
 from shisd.harmonics import _tables
 from tests.bench import conditioning, equation_22, lobes, native, planning, polygons, stability
 from tests.bench.timing import interleaved
@@ -98,7 +98,7 @@ def folded(axes, w):
     degree = len(w) - 1
     l = np.maximum(np.arange(degree + 1), 1)
     scaled = jnp.asarray((w / (l * (l + 1))[:, None]).T[..., None], jnp.float32)
-    tile = jax.checkpoint(lambda v: _moments.fold(scaled, jnp.asarray(axes), v, degree))
+    tile = jax.checkpoint(lambda v: fold(scaled, jnp.asarray(axes), v, degree))
     return lambda v: jax.lax.map(tile, v).reshape(-1)
 
 
@@ -112,9 +112,9 @@ def bench_polygons(degrees=(8, 20)):
         axes = unit(rng.normal(size=(2 * degree + 1, 3))).astype(np.float32)
         w = rng.normal(size=(degree + 1, len(axes))).astype(np.float32)
         w[0] = 0
-        fold = folded(axes, w)
-        ours = jax.jit(fold)
-        gradient = jax.jit(jax.value_and_grad(lambda v, fold=fold: jnp.sum(fold(v))))
+        summed = folded(axes, w)
+        ours = jax.jit(summed)
+        gradient = jax.jit(jax.value_and_grad(lambda v, summed=summed: jnp.sum(summed(v))))
         times = interleaved(
             {
                 "ours": ours,

@@ -13,7 +13,7 @@ import pytest
 from jax.test_util import check_grads
 
 from shisd import domains
-from shisd.domains import _moments
+from shisd.domains.moments import fold, moments
 from tests import truth
 from tests.hard_cases import AXES_AT_POLYGONS, HALF_TURNS, POLYGONS, TINY, axes_for, padded, random_polygon, unit
 
@@ -30,8 +30,8 @@ def evaluated(vertices, axes, weights):
     """Of all moments to degree 40 a weighted sum's gradients in vertices and axes, and the moments."""
 
     def total(v, d):
-        moments = domains.zonal_moments(domains.SphericalPolygon(v), d, DEGREE)
-        return jnp.sum(moments * weights), moments
+        values = domains.zonal_moments(domains.SphericalPolygon(v), d, DEGREE)
+        return jnp.sum(values * weights), values
 
     return jax.grad(total, (0, 1), has_aux=True)(vertices, axes)
 
@@ -195,8 +195,8 @@ def test_fold_agrees_with_moments(x64, rng):
     v = np.stack([random_polygon(rng, 4, s) for s in (1.0, 0.01)]).transpose(2, 1, 0)
     v, axes, w = jnp.asarray(v), jnp.asarray(unit(rng.normal(size=(3, 3)))), jnp.asarray(rng.normal(size=(3, 8, 1)))
     l = np.arange(1.0, 8)
-    folded = lambda v: _moments.fold(w, axes, v, 7)
-    summed = lambda v: jnp.einsum("lkp,klq,l->p", _moments.moments(axes, v, 7), w[:, 1:], l * (l + 1))
+    folded = lambda v: fold(w, axes, v, 7)
+    summed = lambda v: jnp.einsum("lkp,klq,l->p", moments(axes, v, 7), w[:, 1:], l * (l + 1))
     (got, back), (expected, back_expected) = (jax.vjp(jax.jit(f), v) for f in (folded, summed))
     gradient, expected_gradient = back(jnp.ones(2))[0], back_expected(jnp.ones(2))[0]
     np.testing.assert_allclose(got, expected, rtol=1e-12)
@@ -210,9 +210,9 @@ def test_high_degree_and_fold_agree(dtype, rng):
     axes = jnp.asarray(unit(rng.normal(size=(3, 3))), dtype)
     for degree in (1, 7, 40, 70):
         w = jnp.asarray(rng.normal(size=(3, degree + 1, 1)), dtype)
-        expected = jnp.einsum("lkp,klq->p", _moments.moments(axes, v, degree), w[:, 1:])
+        expected = jnp.einsum("lkp,klq->p", moments(axes, v, degree), w[:, 1:])
         l = np.maximum(np.arange(degree + 1), 1)
-        got = _moments.fold(w / jnp.asarray(l * (l + 1), dtype)[None, :, None], axes, v, degree)
+        got = fold(w / jnp.asarray(l * (l + 1), dtype)[None, :, None], axes, v, degree)
         np.testing.assert_allclose(got, expected, rtol={"float64": 1e-11, "float32": 1e-3}[dtype.name], atol=1e-9)
 
 

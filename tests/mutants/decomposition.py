@@ -131,14 +131,14 @@ MUTANTS = [
     ),
     Mutant(
         "predictions without the number of harmonics",
-        "shisd/planning.py",
+        "shisd/planning/_prediction.py",
         old="energy / (2 * np.arange(slices.shape[-1]) + 1)",
         new="energy",
         test="tests/test_planning.py::test_prediction_is_the_mean_over_rotations_and_the_bound_holds",
     ),
     Mutant(
         "predictions of the mean of the colours",
-        "shisd/planning.py",
+        "shisd/planning/_prediction.py",
         old="float(np.max(np.where(dark, 0, x / np.where(dark, 1, radiance))))",
         new="float(np.sqrt(np.sum(x**2) / np.sum(radiance**2)))",
         test="tests/test_planning.py::test_errors_are_those_of_the_worst_colour",

@@ -2,53 +2,55 @@
 
 from tests.mutants import Mutant
 
-_MOMENTS, _POLYGON = "shisd/domains/_moments.py", "shisd/domains/_polygon.py"
+_POLYGON, _MOMENTS = "shisd/domains/_polygon.py", "shisd/domains/moments"
+_EDGES, _RECURRENCE = f"{_MOMENTS}/_edges.py", f"{_MOMENTS}/_recurrence.py"
+_DERIVATIVES, _FOLD = f"{_MOMENTS}/_derivatives.py", f"{_MOMENTS}/_fold.py"
 _CASE = "tests/domains/test_moments.py::test_values_and_derivatives"
 
 MUTANTS = [
     Mutant(
-        "no gradient of moments in the outline", _MOMENTS,
+        "no gradient of moments in the outline", _DERIVATIVES,
         old="return -jax.lax.scan(step, terms.start()", new="return 0 * jax.lax.scan(step, terms.start()",
         test=f"{_CASE}[non-convex]",
     ),
     Mutant(
-        "no gradient of moments in the axes", _MOMENTS,
+        "no gradient of moments in the axes", _DERIVATIVES,
         old="(axes,), (d_axes,))\n    if", new="(axes,), (0 * d_axes,))\n    if",
         test=f"{_CASE}[non-convex]",
     ),
     Mutant(
-        "no gradient of sums of moments in the outline", _MOMENTS,
-        old="change -= _sum_first(speed * weight)", new="change -= _sum_first(0 * speed * weight)",
+        "no gradient of sums of moments in the outline", _FOLD,
+        old="change -= sum_first(speed * weight)", new="change -= sum_first(0 * speed * weight)",
         test="tests/domains/test_moments.py::test_fold_agrees_with_moments",
     ),
     Mutant(
-        "lengths tilt the middle of an edge", _MOMENTS,
+        "lengths tilt the middle of an edge", _EDGES,
         old="return chord, middle - tilt[None] * chord", new="return chord, middle",
         test=f"{_CASE}[edge 1e-03 rad short of pi]",
     ),
     Mutant(
-        "a sum of ends where they cancel", _MOMENTS,
+        "a sum of ends where they cancel", _RECURRENCE,
         old="dot(edge.middle, d), dot(edge.normal, d)", new="u0 + u1, dot(edge.normal, d)",
         test=f"{_CASE}[edge 1e-03 rad short of pi]",
     ),
     Mutant(
-        "a difference of line integrals where it cancels", _MOMENTS,
+        "a difference of line integrals where it cancels", _DERIVATIVES,
         old=".eps) ** 0.25", new=".eps) * 0",
         test=f"{_CASE}[solid angle 2e-12]",
     ),
     Mutant(
-        "an angle over its tangent from what it lacks to 1", _MOMENTS,
+        "an angle over its tangent from what it lacks to 1", _EDGES,
         old="return jnp.where(small, series, part - 1), part",
         new="tail = jnp.where(small, series, part - 1)\n    return tail, 1 + tail",
         test=f"{_CASE}[edge 1e-04 rad short of pi]",
     ),
     Mutant(
-        "short edges are points", _MOMENTS,
+        "short edges are points", _EDGES,
         old="1e4 * jnp.finfo(t2.dtype).tiny", new="(64 * jnp.finfo(t2.dtype).eps) ** 2",
         test=f"{_CASE}[solid angle 2e-12]",
     ),
     Mutant(
-        "cosine powers without the edge's plane", _MOMENTS,
+        "cosine powers without the edge's plane", _RECURRENCE,
         old="(n - 1) * (1 - x.g2) * f0", new="(n - 1) * f0",
         test="tests/domains/test_moments.py::test_powers_against_quadrature_and_closed_values[float32]",
     ),

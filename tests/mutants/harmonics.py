@@ -3,7 +3,7 @@
 from tests.mutants import Mutant
 
 _SH, _TRANSFORM, _ROTATION = (f"shisd/harmonics/_{name}.py" for name in ("sh", "transform", "rotation"))
-_ENVIRONMENT, _REFERENCE = "shisd/models/_environment.py", "shisd/reference.py"
+_ENVIRONMENT, _REFERENCE = "shisd/models/_environment.py", "shisd/reference/_monte_carlo.py"
 _OF_SH, _OF_TRANSFORM, _OF_ROTATION = (f"tests/harmonics/test_{name}.py" for name in ("sh", "transform", "rotation"))
 _OF_ENVIRONMENT = "tests/models/test_environment.py"
 
@@ -147,6 +147,13 @@ MUTANTS = [
         old="    strength = jnp.where(active, jnp.exp(root), 0)\n",
         new="    strength = jnp.where(active, 0.99 * jnp.exp(root), 0)\n",
         test="tests/harmonics/test_windows.py::test_dering_takes_each_expansion_by_itself",
+    ),
+    Mutant(
+        "ambisonic channels as coefficients of their basis",
+        "shisd/harmonics/_conventions.py",
+        old="np.sqrt(4 * np.pi / (2 * l + 1))",
+        new="np.sqrt((2 * l + 1) / (4 * np.pi))",
+        test="tests/harmonics/test_conventions.py::test_ambisonic_channels_hold_their_sources",
     ),
     Mutant(
         "maps of other programs mirrored",

@@ -187,10 +187,10 @@ MUTANTS = [
     ),
     Mutant(
         "the reference imports harmonics",
-        "shisd/reference.py",
+        "shisd/reference/_environment.py",
         old="from shisd.models import AbstractBrdf, Environment\n",
         new="from shisd.harmonics import sh_basis\nfrom shisd.models import AbstractBrdf, Environment\n",
-        test="tests/test_layering.py::test_what_a_module_imports[reference.py]",
+        test="tests/test_layering.py::test_what_a_module_imports[reference/_environment.py]",
     ),
     Mutant(
         "harmonics imports filtering",

@@ -13,8 +13,8 @@ MUTANTS = [
         new="return 0 * jax.jvp(lambda v: _fold(rows, v, degree, spare), (v,), (by,))[1]", test=SLICE,
     ),
     Mutant(
-        "outline gradients of integrals are zero", "shisd/domains/_moments.py",
-        old="change -= _sum_first(speed * weight)", new="change -= 0 * _sum_first(speed * weight)", test=SLICE,
+        "outline gradients of integrals are zero", "shisd/domains/moments/_fold.py",
+        old="change -= sum_first(speed * weight)", new="change -= 0 * sum_first(speed * weight)", test=SLICE,
     ),
     Mutant(
         "the plane of incidence does not turn with the view", "shisd/shading/_incidence.py",

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shisd.shading.slices._tabulate import by_convergence
 
 from shisd import models, shading
 from shisd.shading import _views
+from shisd.shading.slices._tabulate import by_convergence
 from tests.models.materials import hemisphere_rule
 from tests.truth import scipy_basis
 

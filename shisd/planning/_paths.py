@@ -1,0 +1,217 @@
+"""The ways from a material and a light to radiance: what each leaves out, its cost, and the call."""
+
+import abc
+import functools
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from shisd._module import Module
+from shisd._typing import Array, Float
+from shisd.harmonics import convolve, evaluate
+from shisd.models import Environment, PolygonLight, PortalLight
+from shisd.planning._bands import Distant, Local, Material
+from shisd.planning._tables import Tables
+from shisd.shading import Slices, shade_environment, shade_polygon, shade_portal, shade_zonal
+
+
+class Path(Module):
+    """One way from a material and a light to radiance: where it serves, what it leaves out, its cost, and the call.
+
+    A new path is one more class in `PATHS`.
+    """
+
+    name: ClassVar[str]
+    takes: ClassVar[type]
+
+    @staticmethod
+    @abc.abstractmethod
+    def left_out(material: Material, light: Any, degree: int) -> tuple[np.ndarray, np.ndarray]:
+        """Band norms of slices [C, V, l] and lights [C, P, l] whose product is what the path leaves out."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def cost(material: Material, light: Any, degree: int) -> float:
+        """Multiply-adds per pixel: a model, of the products that grow with the degree."""
+
+    @classmethod
+    @abc.abstractmethod
+    def make(cls, material: Material, tables: Tables, lights: list, degree: int) -> "Path":
+        """The path, ready to be called."""
+
+    @abc.abstractmethod
+    def shade(self, positions: Any, normals: Array, views: Array, tangents: Array | None) -> Array:
+        """Radiance [..., *colour]; `positions` are None where no light is local."""
+
+
+class Irradiance(Path):
+    """Slices that are zonal about the normal and the same from all sides, of matt materials: the light convolved."""
+
+    name = "irradiance"
+    takes = Environment
+    coefficients: Float[Array, "*colour n"]
+
+    @staticmethod
+    def left_out(material, light, degree):
+        low = np.arange(material.degree + 1) <= degree
+        return np.where(low, material.uneven, material.norms), light.norms
+
+    @staticmethod
+    def cost(material, light, degree):
+        return float(max(material.colours, light.colours) * (degree + 1) * (2 * degree + 1))
+
+    @classmethod
+    def make(cls, material, tables, lights, degree):
+        kernel = material.mean_zonal[:, : degree + 1]
+        kernel, e = jnp.asarray(kernel, float), _sum(lights, degree)
+        c = convolve(e, kernel if material.coloured or e.ndim == 2 else kernel[0])
+        return cls(c)
+
+    def shade(self, positions, normals, views, tangents):
+        c = self.coefficients.reshape(-1, 1, self.coefficients.shape[-1])
+        values = evaluate(c, normals.reshape(-1, 3)).T.reshape(*normals.shape[:-1], *self.coefficients.shape[:-1])
+        below = jnp.sum(normals * views, axis=-1) < 0
+        return jnp.where(below.reshape(*below.shape, *(1,) * (values.ndim - below.ndim)), 0, values)
+
+
+class Zonal(Path):
+    """Distant light that is symmetric about an axis: nothing is rotated."""
+
+    name = "zonal light"
+    takes = Environment
+    slices: Slices
+    axis: Float[Array, "3"]
+    coefficients: Float[Array, "*colour l"]
+
+    @staticmethod
+    def left_out(material, light, degree):
+        low = np.arange(material.degree + 1) <= degree
+        return material.norms, np.where(low, light.off_axis, light.norms)
+
+    @staticmethod
+    def cost(material, light, degree):
+        n = (degree + 1) ** 2
+        return _lookup_cost(material, degree) + n * (2 * (degree + 1) + max(material.colours, light.colours))
+
+    @classmethod
+    def make(cls, material, tables, lights, degree):
+        (light,) = lights
+        z = jnp.asarray(light.zonal[:, : degree + 1], float)
+        return cls(tables.slices(degree), jnp.asarray(light.axis, float), z if light.coloured else z[0])
+
+    def shade(self, positions, normals, views, tangents):
+        return shade_zonal(self.slices, self.axis, self.coefficients, normals, views, tangents)
+
+
+class Table(Path):
+    """Any distant light, turned to the frame of every pixel and multiplied with the slice of its view."""
+
+    name = "table"
+    takes = Environment
+    slices: Slices
+    coefficients: Float[Array, "*colour n"]
+
+    @staticmethod
+    def left_out(material, light, degree):
+        return np.where(np.arange(material.degree + 1) <= degree, 0, material.norms), light.norms
+
+    @staticmethod
+    def cost(material, light, degree):
+        series = (degree + 1) ** 3  # of one angle, which all pixels share
+        exchange = _bands_squared(degree) / 4
+        colours = max(material.colours, light.colours)
+        return _lookup_cost(material, degree) + series * (colours + material.isotropic) + material.colours * exchange
+
+    @classmethod
+    def make(cls, material, tables, lights, degree):
+        return cls(tables.slices(degree), _sum(lights, degree))
+
+    def shade(self, positions, normals, views, tangents):
+        return shade_environment(self.slices, self.coefficients, normals, views, tangents)
+
+
+class Polygon(Path):
+    """A polygon light above the horizon, where alone the slices are fitted."""
+
+    name = "polygon"
+    takes = PolygonLight
+    slices: Slices
+    light: PolygonLight
+
+    @staticmethod
+    def left_out(material, light, degree):
+        return material.misfit(degree), light.norms
+
+    @staticmethod
+    def cost(material, light, degree):
+        if light.light_degree:
+            return _product_cost(material, light, degree)
+        axes, rows = _axes_and_rows(material, degree)
+        moments = 12 * len(light.light.points) * (degree + 1) * axes
+        weights = rows * axes
+        return _lookup_cost(material, degree) + material.colours * (moments + weights)
+
+    @classmethod
+    def make(cls, material, tables, lights, degree):
+        return cls(tables.slices(degree, above=True), lights[0].light)
+
+    def shade(self, positions, normals, views, tangents):
+        return shade_polygon(self.slices, self.light, positions, normals, views, tangents)
+
+
+class Portal(Path):
+    """Distant light through a window, above the horizon, where alone the slices are fitted."""
+
+    name = "portal"
+    takes = PortalLight
+    slices: Slices
+    light: PortalLight
+
+    @staticmethod
+    def left_out(material, light, degree):
+        return material.misfit(degree), light.norms
+
+    @staticmethod
+    def cost(material, light, degree):
+        return _product_cost(material, light, degree)
+
+    @classmethod
+    def make(cls, material, tables, lights, degree):
+        portal = lights[0].light
+        return cls(tables.slices(degree, above=True), portal)
+
+    def shade(self, positions, normals, views, tangents):
+        return shade_portal(self.slices, self.light, positions, normals, views, tangents)
+
+
+PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal)
+
+
+def _sum(lights: list[Distant], degree: int) -> Float[Array, "*colour n"]:
+    """Coefficients of distant lights together, cut at a degree."""
+    parts = [light.coefficients[:, : (degree + 1) ** 2] for light in lights]
+    total = functools.reduce(np.add, parts)
+    return jnp.asarray(total if any(light.coloured for light in lights) else total[0], float)
+
+
+def _lookup_cost(material: Material, degree: int) -> float:
+    azimuths = 1 if material.isotropic else max(32, 2 * degree + 4) + 2  # cosines and sines
+    return float(material.colours * (material.views + 4) * azimuths * _axes_and_rows(material, degree)[1])
+
+
+def _axes_and_rows(material: Material, degree: int) -> tuple[int, int]:
+    """Axes that span the slices, and their coefficients; those of isotropic materials are even across a plane."""
+    return (degree + 1, (degree + 1) * (degree + 2) // 2) if material.isotropic else (2 * degree + 1, (degree + 1) ** 2)
+
+
+def _product_cost(material: Material, light: Local, degree: int) -> float:
+    """Of lights whose radiance depends on direction: moments, their coefficients, the matrix, and the rotation."""
+    total = light.light_degree + degree
+    moments = 12 * len(light.light.points) * (total + 1) * (2 * total + 1) + (2 * total + 1) * (total + 1) ** 2
+    matrix = (total + 1) ** 2 * (degree + 1) ** 2
+    return _lookup_cost(material, degree) + moments + light.colours * (matrix + 2 * _bands_squared(degree))
+
+
+def _bands_squared(degree: int) -> float:
+    return (degree + 1) * (2 * degree + 1) * (2 * degree + 3) / 3

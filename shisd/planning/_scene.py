@@ -1,0 +1,41 @@
+"""The scene that is planned for: materials, lights, and points that see the local ones."""
+
+from shisd import _checks
+from shisd._module import Module
+from shisd._typing import Array, ArrayLike, Float
+from shisd.models import AbstractBrdf, Environment, PolygonLight, PortalLight
+
+Light = Environment | PolygonLight | PortalLight | ArrayLike
+
+
+class Scene(Module):
+    """What is to be shaded: every material under the sum of all lights, without occlusion.
+
+    Arguments: `materials` and `lights` by name; a light is a `models.Environment`, SH coefficients [n] or [colour, n]
+    of distant light, a `models.PolygonLight` or a `models.PortalLight`; `points`
+    [N, 3], representative positions of surfaces, which judge the local lights. A dozen will do: each costs a
+    projection.
+    """
+
+    materials: dict[str, AbstractBrdf]
+    lights: dict[str, Light]
+    points: Float[Array, "n 3"] | None
+
+    def __init__(self, materials: dict[str, AbstractBrdf], lights: dict[str, Light], points: ArrayLike | None = None):
+        if not materials or not lights:
+            raise ValueError(
+                f"a scene needs at least one of `materials` and of `lights`; got {len(materials)} and {len(lights)}."
+            )
+        for name, brdf in materials.items():
+            if not isinstance(brdf, AbstractBrdf):
+                raise ValueError(f"`materials`[{name!r}] must be a models.AbstractBrdf; got {type(brdf).__name__}.")
+        for name, light in lights.items():
+            if isinstance(light, PolygonLight | PortalLight):
+                if points is None:
+                    raise ValueError(f"`lights`[{name!r}] is local; pass `points` [N, 3] that see it.")
+            elif not isinstance(light, Environment):
+                _checks.expansion(f"lights[{name!r}]", light)
+        self.materials, self.lights = dict(materials), dict(lights)
+        self.points = None if points is None else _checks.vectors("points", points).reshape(-1, 3)
+        if self.points is not None and len(self.points) == 0:
+            raise ValueError("`points` must hold at least one position.")
