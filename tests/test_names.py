@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 
+import shisd
 from shisd import decomposition, domains, filtering, harmonics, models, planning, reference, shading
 
 STAGES = (harmonics, decomposition, domains, models, shading, filtering, planning, reference)
@@ -16,12 +17,35 @@ PUBLIC = {f"{s.__name__}.{name}": thing for s in STAGES for name, thing in vars(
 PUBLIC = {name: x for name, x in PUBLIC.items() if callable(x) and getattr(x, "__module__", "").startswith("shisd")}
 
 
+def printed(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+
+
 def test_everything_is_there_after_import_and_optional_packages_are_not_loaded():
     optional = ["matplotlib", "trimesh", "embreex", "OpenEXR", "PIL", "tqdm", "scipy.optimize"]
     code = f"import sys, shisd; shisd.plotting.show_map, shisd.reference.shade_polygon, shisd.io.read_image\n" \
            f"print([name for name in {optional} if name in sys.modules])"  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert printed(code) == "[]"
+
+
+def test_what_only_some_programs_need_is_imported_when_used():
+    later = ["shisd.plotting", "shisd.reference"]
+    code = f"""
+import sys, shisd
+loaded = lambda: [name for name in {[*later, "matplotlib"]} if name in sys.modules]
+print(loaded(), {{"plotting", "reference", "shading"}} <= set(dir(shisd)), loaded())
+from shisd import plotting
+print(shisd.plotting is plotting is sys.modules["shisd.plotting"], loaded())
+print(shisd.reference is sys.modules["shisd.reference"], loaded())
+"""
+    assert printed(code).splitlines() == ["[] True []", f"True {later[:1]}", f"True {later}"]
+
+
+def test_a_name_that_is_not_there_is_named_with_its_module():
+    with pytest.raises(AttributeError, match="module 'shisd' has no attribute 'plots'"):
+        shisd.plots  # noqa: B018
+    with pytest.raises(ImportError, match="cannot import name 'plots' from 'shisd'"):
+        from shisd import plots  # noqa: F401
 
 
 def test_arrays_have_one_name_in_signatures():
