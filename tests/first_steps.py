@@ -12,7 +12,7 @@ import matplotlib
 import numpy as np
 import trimesh
 
-from shisd import decomposition, domains, harmonics, io, models, plotting, shading
+from shisd import domains, harmonics, io, models, plotting, shading
 
 DEGREE = 4
 NORMALS = np.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8]], np.float32)
@@ -23,8 +23,7 @@ LIGHT = np.linspace(1, -1, (DEGREE + 1) ** 2, dtype=np.float32)
 
 def radiance(roughness):
     """What two points send back of distant light and of a lamp, and their sum."""
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(DEGREE), DEGREE)
-    lobes = shading.tabulate_brdf(models.Ggx(roughness), basis)
+    lobes = shading.tabulate_brdf(models.Ggx(roughness), DEGREE)
     lamp = models.PolygonLight(LAMP, two_sided=True)
     distant = shading.shade_environment(lobes, LIGHT, NORMALS, VIEWS)
     near = shading.shade_polygon(lobes, lamp, np.zeros_like(NORMALS), NORMALS, VIEWS)

@@ -214,12 +214,6 @@ CASES = [
         lambda: (basis(),),
         idle=("*",),  # of axes that are optimal several eigenvalues are one; elsewhere in test_basis
     ),
-    Case(
-        "decomposition.RotatedZonalBasis.unchecked_coefficients",
-        lambda b, w: b.unchecked_coefficients(w),
-        lambda: (basis(), normal(N, 3, 5)),
-        (1,),
-    ),
     Case("decomposition.IsotropicBasis.zonal", lambda b: b.zonal(), lambda: (kernels(),), idle=("directions",)),
     Case("decomposition.IsotropicBasis.matrix", lambda b: b.matrix(), lambda: (kernels(),)),
     Case(
