@@ -254,6 +254,11 @@ def test_gradients_do_not_store_every_pixel(rng):
     assert memory.temp_size_in_bytes < 65536 * 49 * 3 * 4
 
 
+def test_a_basis_stands_for_its_degree():
+    of = lambda degree: shading.tabulate_brdf(models.Lambertian(0.5), degree, views=4).coefficients
+    np.testing.assert_array_equal(of(basis()), of(DEGREE))
+
+
 def test_errors_name_the_argument(as_user, rng):
     light, normals, views, _ = scene(rng, 2, np.float32)
     lobes = lobes_of("glossy")

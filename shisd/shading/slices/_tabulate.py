@@ -22,6 +22,7 @@ from shisd import _checks
 from shisd._numerics import safe_sqrt
 from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics.internal import orders, weighted_sums
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
@@ -33,7 +34,7 @@ Pytree = TypeVar("Pytree")
 
 def tabulate_brdf(
     brdf: AbstractBrdf,
-    degree: int,
+    degree: int | RotatedZonalBasis,
     *,
     views: int = 64,
     azimuths: int | None = None,
@@ -46,10 +47,10 @@ def tabulate_brdf(
 ) -> Slices:
     """A material's cosine-weighted view slices, projected on spherical harmonics (ISD15 Eq. 21).
 
-    Arguments: `brdf`. Static: `degree`; `views`, elevations of the table, at least 4; `azimuths`,
-    even, for anisotropic materials only, by default 2 degree + 4 and at least 32: a slice turns with the view, so its
-    order m goes round m times, and fewer azimuths alias without notice; `quadrature`, nodes from the mirror direction
-    to the horizon (and half as many in each eighth of a turn about it).
+    Arguments: `brdf`. Static: `degree`, or a basis of that degree; `views`, elevations of the table, at least 4;
+    `azimuths`, even, for anisotropic materials only, by default 2 degree + 4 and at least 32: a slice turns with the
+    view, so its order m goes round m times, and fewer azimuths alias without notice; `quadrature`, nodes from the
+    mirror direction to the horizon (and half as many in each eighth of a turn about it).
     `quadrature` None takes 32 + degree nodes, and 3/2 and 9/4 as many where that is not enough: where
     `Slices.quadrature_error` is above `tolerance`. If no rule, or the one given, is enough, it is a ValueError;
     `throw=False` leaves that to the caller. While JAX traces, as under jit and grad, nothing can be chosen: 32 + degree
@@ -71,7 +72,8 @@ def tabulate_brdf(
     """
     if not isinstance(brdf, AbstractBrdf):
         raise ValueError(f"`brdf` must be a models.AbstractBrdf; got {type(brdf).__name__}.")
-    degree, views = _checks.degree(degree), _checks.integer("views", views, 4)
+    degree = degree.degree if isinstance(degree, RotatedZonalBasis) else _checks.degree(degree)
+    views = _checks.integer("views", views, 4)
     azimuths = max(32, 2 * degree + 4) if azimuths is None else _checks.integer("azimuths", azimuths, 4)
     if azimuths % 2:
         raise ValueError(f"`azimuths` must be even; got {azimuths}.")
