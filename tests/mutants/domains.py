@@ -24,6 +24,11 @@ MUTANTS = [
         test="tests/domains/test_moments.py::test_fold_agrees_with_moments",
     ),
     Mutant(
+        "edges that the horizon adds are left out", _FOLD,
+        old="used, edges, share = part\n", new="used, edges, share = part[0] & jnp.any(part[2] != 0), *part[1:]\n",
+        test="tests/shading/test_polygon.py::test_hard_cases[float32-across the horizon, turning inwards]",
+    ),
+    Mutant(
         "lengths tilt the middle of an edge", _EDGES,
         old="return chord, middle - tilt[None] * chord", new="return chord, middle",
         test=f"{_CASE}[edge 1e-03 rad short of pi]",

@@ -17,6 +17,12 @@ MUTANTS = [
         old="change -= sum_first(speed * weight)", new="change -= 0 * sum_first(speed * weight)", test=SLICE,
     ),
     Mutant(
+        "gradients keep a tile of every light", "shisd/shading/_surface.py",
+        old="add = jax.checkpoint(lambda x, light: (x + radiance(light), None), prevent_cse=False)",
+        new="add = lambda x, light: (x + radiance(light), None)",
+        test=POLYGON + "test_gradients_keep_no_tile_of_each_light",
+    ),
+    Mutant(
         "the plane of incidence does not turn with the view", "shisd/shading/_incidence.py",
         old="dv += back * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]", new="dv += 0 * back",
         test=SLICE,

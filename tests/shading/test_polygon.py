@@ -289,6 +289,19 @@ def test_code_does_not_grow_with_lights_and_colours(rng):
     assert rgb < 1.1 * one
 
 
+def test_gradients_keep_no_tile_of_each_light(rng):
+    surface = [a.astype(np.float32) for a in scene(rng, 2048)]
+    quads = np.stack([QUAD + i for i in range(20)]).astype(np.float32)
+
+    def memory(count):
+        shade = lambda quads: shading.shade_polygon(
+            slices("float32"), [models.PolygonLight(q) for q in quads], *surface
+        ).sum()
+        return jax.jit(jax.grad(shade)).lower(quads[:count]).compile().memory_analysis().temp_size_in_bytes
+
+    assert memory(20) < 1.1 * memory(2)  # measured 1.00
+
+
 def test_a_portal_is_the_light_behind_it(rng):
     """Several windows, and what changes with the light in their field; far away as at the origin."""
     lobes, (position, normal, view) = slices("float32"), (np.round(64 * a) / 64 for a in scene(rng, 4))
