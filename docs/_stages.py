@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import re
+import typing
 from types import ModuleType
 from typing import Any
 
@@ -11,13 +12,9 @@ from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
+from sphinx.util.typing import stringify_annotation
 
 LABELS = "Accuracy|Arguments|Bad values|Cost|Derivatives|Energy|Errors|Memory|Returns|Source"
-DIRECTIVES = {
-    "class": ("autoclass", "   :members:"),
-    "function": ("autofunction",),
-    "data": ("autodata", "   :no-value:"),
-}
 
 
 def public(module: ModuleType) -> list[str]:
@@ -55,7 +52,15 @@ def as_rst(text: str) -> list[str]:
 
 def summary(text: str) -> str:
     """The first sentence."""
-    return re.split(r"(?<!Eq)\.\s(?=[A-Z])", " ".join(text.split("\n\n")[0].split()))[0].rstrip(".")
+    return re.split(r"(?<!Eq)(?<!\.)\.\s(?=[A-Z])", " ".join(text.split("\n\n")[0].split()))[0].rstrip(".")
+
+
+def value(thing: object) -> str:
+    """What a tuple holds, or a type that has been given a name stands for; nothing for classes and functions."""
+    if isinstance(thing, tuple):
+        return ", ".join(getattr(x, "__name__", repr(x)) for x in thing)
+    named = typing.get_origin(thing) is not None
+    return re.sub(r"(\w+\.)+(?=\w)", "", stringify_annotation(thing)) if named else ""
 
 
 class Stage(SphinxDirective):
@@ -68,11 +73,13 @@ class Stage(SphinxDirective):
         names, entries = [], []
         for name in public(module):
             thing, path = getattr(module, name), f"{module.__name__}.{name}"
-            kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
-            about = summary(inspect.getdoc(thing) or "") if kind != "data" else ""
-            names.append(f"- :py:obj:`{name} <{path}>`" + (f": {' '.join(as_rst(about))}" if about else ""))
-            directive, *options = DIRECTIVES[kind]
-            entries += [f".. {directive}:: {path}", *options, ""]
+            if about := value(thing):
+                entries += [f".. py:data:: {path}", f"   :value: {about}", ""]
+            else:
+                about = summary(inspect.getdoc(thing) or "")
+                directive = "autoclass" if inspect.isclass(thing) else "autofunction"
+                entries += [f".. {directive}:: {path}", *["   :members:"] * inspect.isclass(thing), ""]
+            names.append(f"- :py:obj:`{name} <{path}>`: {' '.join(as_rst(about))}")
         text = [*as_rst(inspect.getdoc(module) or ""), "", *names, "", *entries]
         return self.parse_text_to_nodes("\n".join(text))
 

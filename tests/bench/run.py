@@ -303,7 +303,7 @@ def main():
     parser.add_argument("--output", type=Path, default=Path("output/bench"))
     parser.add_argument("--only", choices=BENCHES, action="append")
     parser.add_argument("--pages", action="store_true", help="put the tables into docs/benchmarks.md")
-    parser.add_argument("--paste", nargs=2, metavar=("NAME", "FILE"), help="put an example's table there")
+    parser.add_argument("--paste", nargs=2, metavar=("NAME", "FILE"), help="put an example's table into that page")
     parser.add_argument("--memory-child", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.memory_child is not None:
