@@ -7,7 +7,7 @@ an error. Then every device gets as many pixels as one had alone, and the table 
     python examples/many_devices.py --output output/many_devices
     python examples/many_devices.py --sizes
 
-`many_devices.md` beside this file explains what to write, and what limits it at thousands of devices.
+`docs/guides/many_devices.md` explains what to write, and what limits it at thousands of devices.
 """
 
 import argparse

@@ -1,7 +1,8 @@
-"""Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--readme].
+"""Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--pages].
 
-Writes DIR/report.json with every row, DIR/report.md with tables, and a figure for each group of tasks; --readme also
-puts both into examples/ and the short tables between the README's markers. `make report` sets the allocator.
+Writes DIR/report.json with every row, DIR/report.md with tables, and a figure for each group of tasks to DIR/figures;
+--pages also puts both into docs/ and the short tables between the markers of docs/benchmarks.md. `make report` sets the
+allocator.
 """
 
 import argparse
@@ -16,7 +17,7 @@ import numpy as np
 
 from shisd import io
 from tests.bench import applications, environments, harness, local_lights, renderers, roofline, spherical
-from tests.bench.run import paste, table
+from tests.bench.run import DOCS, paste, table
 
 GROUPS = {  # name: (title, tasks)
     "environments": ("A sphere under a map", environments.tasks),
@@ -68,7 +69,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("output/report"))
     parser.add_argument("--quick", action="store_true", help="few tasks and settings: a check, in two minutes")
     parser.add_argument("--only", choices=[*GROUPS, *TABLES], action="append")
-    parser.add_argument("--readme", action="store_true", help="put tables into README.md and figures into examples/")
+    parser.add_argument("--pages", action="store_true", help="put tables and figures into docs/")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
     wanted = arguments.only or [name for name in (*GROUPS, *TABLES) if name not in APART]
@@ -80,7 +81,9 @@ def main() -> None:
         sections[name] = short, long
         print(f"{long}\n\n[{time.perf_counter() - start:.0f} s]\n", flush=True)
 
-    folders = [arguments.output, *([Path("examples")] if arguments.readme else [])]
+    folders = [arguments.output, *([DOCS] if arguments.pages else [])]
+    for folder in folders:
+        (folder / "figures").mkdir(parents=True, exist_ok=True)
     for name, (title, make) in GROUPS.items():
         if name not in wanted:
             continue
@@ -97,12 +100,11 @@ def main() -> None:
         for item, of_item in panels.items():
             file = f"{name}.png" if len(panels) == 1 else f"{name}_{item}.png"
             for folder in folders:
-                harness.draw(of_item, item, folder / file)
+                harness.draw(of_item, item, folder / "figures" / file)
             lead = "Time over ours at equal error, where that is least, and that error; errors from 10 % to our least."
-            short.append(f"![{title}: relative error against us per {item}](examples/{file})\n\n{lead}")
-            short.append(table(leads(of_item, item)))
-            long.append(f"![{title}: relative error against us per {item}]({file})\n\n{lead}")
-            long.append(table(leads(of_item, item)))
+            shown = f"![{title}: relative error against us per {item}](figures/{file})\n\n{lead}"
+            short += [shown, table(leads(of_item, item))]
+            long += [shown, table(leads(of_item, item))]
             long.append("Every method: medians of its costs, and its relative RMSE in each task.")
             long.append(table(summary(of_item, item)))
         if name == "renderers":
@@ -121,11 +123,11 @@ def main() -> None:
     io.write_atomically(arguments.output / "report.json", json.dumps(results, indent=1), overwrite=True)
     for folder in folders[:1] if arguments.only else folders:  # a part does not replace the whole
         io.write_atomically(folder / "report.md", report, overwrite=True)
-    for name, (short, long) in sections.items() if arguments.readme else ():
+    for name, (short, long) in sections.items() if arguments.pages else ():
         if name in APART:
             text = f"# {name.capitalize()}\n\n{note}\n\n{long}\n"
-            io.write_atomically(f"examples/{name}.md", text, overwrite=True)
-        if f"<!-- table:{name} -->" in Path("README.md").read_text():
+            io.write_atomically(DOCS / f"{name}.md", text, overwrite=True)
+        if f"<!-- table:{name} -->" in (DOCS / "benchmarks.md").read_text():
             paste(name, short)
     print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")
 

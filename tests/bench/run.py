@@ -1,6 +1,7 @@
-"""Measure speed beside error and write the tables: python -m tests.bench.run [--output DIR] [--readme] [--only NAME].
+"""Measure speed beside error and write the tables: python -m tests.bench.run [--output DIR] [--pages] [--only NAME].
 
-Results go to DIR/bench.json and DIR/bench.md; --readme also puts the tables between the README's bench markers.
+Results go to DIR/bench.json and DIR/bench.md; --pages also puts the tables between the markers of
+docs/benchmarks.md and figures into docs/figures/.
 Allocator: outputs of tens of megabytes page-fault on every call with glibc's defaults, for every method alike; `make
 bench` sets MALLOC_ARENA_MAX=1 MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4000000000 MALLOC_TOP_PAD_=1000000000. XLA
 flags: default.
@@ -64,9 +65,7 @@ def bench_equation_22(degrees=(4, 8, 16, 30)):
                 "first call s": times[name].first,
             })  # fmt: skip
         gradient = jax.jit(
-            jax.grad(
-                lambda n, v, m=material, light=light: jnp.sum(shading.shade_environment(m, light, n, v)), (0, 1)
-            )
+            jax.grad(lambda n, v, m=material, light=light: jnp.sum(shading.shade_environment(m, light, n, v)), (0, 1))
         )
         forward = candidates["rotated"]
         times = interleaved({"gradient": gradient, "forward": forward}, normals[:count], views[:count])
@@ -244,6 +243,7 @@ def cost_figure(rows, path):
     pyplot.close(figure)
 
 
+DOCS = Path("docs")
 BENCHES = {
     "equation_22": bench_equation_22,
     "memory": bench_memory,
@@ -265,13 +265,13 @@ FIGURES = {
     "kernels": ("conditioning.png", conditioning.kernels_figure),
     "lobes": ("lobes.png", lobes.figure),
 }
-README = {  # markers, and the benchmarks whose tables stand between them
+PAGES = {  # markers, and the benchmarks whose tables stand between them
     "conditioning": ("directions", "objectives", "kernels", "kernel_pictures"),
     "lobes": ("lobes",),
     "planning": ("prediction", "saving"),
     "stability": ("stability",),
 }
-README["bench"] = tuple(name for name in BENCHES if not any(name in names for names in README.values()))
+PAGES["bench"] = tuple(name for name in BENCHES if not any(name in names for names in PAGES.values()))
 
 
 def table(rows):
@@ -291,19 +291,19 @@ def table(rows):
 
 
 def paste(name, text):
-    """Put a text between the README's markers of a name."""
-    readme, start = Path("README.md"), f"<!-- table:{name} -->"
-    before, rest = readme.read_text().split(start)
+    """Put a text between the markers of a name in the page of benchmarks."""
+    page, start = DOCS / "benchmarks.md", f"<!-- table:{name} -->"
+    before, rest = page.read_text().split(start)
     rest = rest.split("<!-- /table -->", 1)[1]
-    io.write_atomically(readme, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
+    io.write_atomically(page, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, default=Path("output/bench"))
     parser.add_argument("--only", choices=BENCHES, action="append")
-    parser.add_argument("--readme", action="store_true", help="put the tables into README.md")
-    parser.add_argument("--paste", nargs=2, metavar=("NAME", "FILE"), help="put an example's table into README.md")
+    parser.add_argument("--pages", action="store_true", help="put the tables into docs/benchmarks.md")
+    parser.add_argument("--paste", nargs=2, metavar=("NAME", "FILE"), help="put an example's table into that page")
     parser.add_argument("--memory-child", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.memory_child is not None:
@@ -320,14 +320,14 @@ def main():
         if name in FIGURES:
             file, draw = FIGURES[name]
             draw(results[name], arguments.output / file)
-            if arguments.readme:
-                draw(results[name], Path("examples") / file)
+            if arguments.pages:
+                draw(results[name], DOCS / "figures" / file)
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
     io.write_atomically(arguments.output / "bench.json", json.dumps(results, indent=1), overwrite=True)
     io.write_atomically(arguments.output / "bench.md", "\n\n".join([*sections.values(), note]) + "\n", overwrite=True)
-    for marker, names in README.items() if arguments.readme else ():
+    for marker, names in PAGES.items() if arguments.pages else ():
         if all(name in sections for name in names):
             paste(marker, "\n\n".join([*(sections[name] for name in names), note]))
 
