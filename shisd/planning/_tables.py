@@ -1,5 +1,7 @@
 """Slices of a material at all the degrees that its paths ask for, from one table."""
 
+import jax.numpy as jnp
+
 from shisd.models import AbstractBrdf
 from shisd.shading import Slices, tabulate_brdf
 from shisd.shading.internal import RIDGE, fit_above
@@ -19,7 +21,7 @@ class Tables:
 
     def _cut(self, degree: int, above: bool) -> Slices:
         every, domain = self._all, "upper" if above else "sphere"
-        c = every.coefficients[..., : (degree + 1) ** 2]
+        c = jnp.asarray(every.coefficients[..., : (degree + 1) ** 2], float)  # as all that is planned
         if above:
             c = fit_above(c, RIDGE)
         return Slices(c, quadrature_error=every.quadrature_error, isotropic=every.isotropic, domain=domain)
