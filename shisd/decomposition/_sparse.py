@@ -55,7 +55,7 @@ def _choose(basis: RotatedZonalBasis, c: Float[Array, "*batch n"], count: int) -
         return (project(left), project(rest)), k
 
     _, chosen = jax.lax.scan(choose, jax.lax.stop_gradient((m, target)), length=count)
-    # By least norm, which has derivatives in the axes, where axes are as many as a band has coefficients.
+    # Where a band has no more coefficients than axes, least norm: least squares there have no derivatives in the axes.
     columns = m[:, :, chosen]
     wide = min((count + 1) // 2, basis.degree + 1)
     mask = padding(basis.degree)[1][:wide]

@@ -131,17 +131,26 @@ class Table(Path):
         return shade_environment(self.slices, self.coefficients, normals, views, tangents)
 
 
-class Polygon(Path):
-    """A polygon light above the horizon, where alone the slices are fitted."""
+class AboveHorizon(Path):
+    """A local light above the horizon, where alone the slices are fitted."""
 
-    name = "polygon"
-    takes = PolygonLight
     slices: Slices
-    light: PolygonLight
+    light: Any
 
     @staticmethod
     def left_out(material, light, degree):
         return material.misfit(degree), light.norms
+
+    @classmethod
+    def make(cls, material, tables, lights, degree):
+        return cls(tables.slices(degree, above=True), lights[0].light)
+
+
+class Polygon(AboveHorizon):
+    """A polygon light."""
+
+    name = "polygon"
+    takes = PolygonLight
 
     @staticmethod
     def cost(material, light, degree):
@@ -152,34 +161,19 @@ class Polygon(Path):
         weights = rows * axes
         return _lookup_cost(material, degree) + material.colours * (moments + weights)
 
-    @classmethod
-    def make(cls, material, tables, lights, degree):
-        return cls(tables.slices(degree, above=True), lights[0].light)
-
     def shade(self, positions, normals, views, tangents):
         return shade_polygon(self.slices, self.light, positions, normals, views, tangents)
 
 
-class Portal(Path):
-    """Distant light through a window, above the horizon, where alone the slices are fitted."""
+class Portal(AboveHorizon):
+    """Distant light through a window."""
 
     name = "portal"
     takes = PortalLight
-    slices: Slices
-    light: PortalLight
-
-    @staticmethod
-    def left_out(material, light, degree):
-        return material.misfit(degree), light.norms
 
     @staticmethod
     def cost(material, light, degree):
         return _product_cost(material, light, degree)
-
-    @classmethod
-    def make(cls, material, tables, lights, degree):
-        portal = lights[0].light
-        return cls(tables.slices(degree, above=True), portal)
 
     def shade(self, positions, normals, views, tangents):
         return shade_portal(self.slices, self.light, positions, normals, views, tangents)

@@ -95,6 +95,13 @@ MUTANTS = [
         test="tests/shading/test_prefiltered.py::test_error_is_as_predicted[glossy-float32]",
     ),
     Mutant(
+        "sparse weights do not follow their axes",
+        "shisd/decomposition/_sparse.py",
+        old="columns = m[:, :, chosen]",
+        new="columns = jax.lax.stop_gradient(m)[:, :, chosen]",
+        test="tests/decomposition/test_fit.py::test_sparse_weights_have_derivatives_in_axes[3]",
+    ),
+    Mutant(
         "tables that state no error",
         "shisd/shading/slices/_tabulate.py",
         old="jnp.maximum(2 * safe_sqrt(jnp.max(square)),",

@@ -93,8 +93,8 @@ class Slices(Module):
         """
         if not isinstance(basis, RotatedZonalBasis):
             raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis; got {type(basis).__name__}.")
-        options: dict = {"quadrature_error": quadrature_error, "isotropic": isotropic, "domain": domain}
-        return cls(basis.coefficients(weights), **options)
+        c = basis.coefficients(weights)
+        return cls(c, quadrature_error=quadrature_error, isotropic=isotropic, domain=domain)
 
 
 def check_slices(material: object, *, everywhere: bool) -> None:
