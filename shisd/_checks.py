@@ -49,6 +49,14 @@ def scalar(name: str, value: ArrayLike) -> Array:
     return array
 
 
+def colour(name: str, value: ArrayLike) -> Array:
+    """`value` as one floating number for all colours, or one for each."""
+    array = real_array(name, value)
+    if array.ndim > 1:
+        raise ValueError(f"`{name}` must be a scalar or [colour]; got shape {list(array.shape)}.")
+    return array
+
+
 def vectors(name: str, value: ArrayLike) -> Array:
     """`value` as floating vectors [..., 3]."""
     array = real_array(name, value)

@@ -113,6 +113,12 @@ def _grid(degree: int) -> tuple[int, int]:
     return degree // 2 + 1, degree + 1
 
 
+def product_matrices(light: Float[Array, "*colour_n"], degree: int, input_degree: int) -> Float[Array, "*colour_n_m"]:
+    """`product_matrix` of the light of every colour."""
+    of_one = lambda c: product_matrix(c, degree, input_degree=input_degree)
+    return of_one(light) if light.ndim == 1 else jax.vmap(of_one)(light)
+
+
 def convolve(coefficients: ArrayLike, zonal: ArrayLike) -> Float[Array, "*batch n"]:
     """Coefficients of an expansion convolved with a zonal kernel over all rotations.
 

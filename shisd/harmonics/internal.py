@@ -4,6 +4,7 @@ from shisd.harmonics._pairing import Each as Each
 from shisd.harmonics._pairing import pair_many as pair_many
 from shisd.harmonics._pairing import rows as rows
 from shisd.harmonics._pairing import turned_series as turned_series
+from shisd.harmonics._products import product_matrices as product_matrices
 from shisd.harmonics._quadrature import gauss_rows as gauss_rows
 from shisd.harmonics._rotation import rotate_many as rotate_many
 from shisd.harmonics._sh import angles_of as angles_of

@@ -13,6 +13,7 @@ from jax.typing import DTypeLike
 from shisd import _checks, harmonics, io
 from shisd._module import Module
 from shisd._typing import Array, ArrayLike, Float
+from shisd.models.lights._distant import DistantLight
 
 
 def _map(value: ArrayLike) -> Array:
@@ -122,6 +123,10 @@ class Environment(Module):
     def coefficients(self, degree: int, *, texels: Literal["cells", "samples"] = "cells") -> Float[Array, "*colour n"]:
         """SH coefficients [*colour, (degree + 1)^2] of the map (`shisd.harmonics.project_map`)."""
         return harmonics.project_map(self.texels, degree, texels=texels)
+
+    def light(self, degree: int, *, texels: Literal["cells", "samples"] = "cells") -> DistantLight:
+        """The map as `DistantLight` of this degree."""
+        return DistantLight(self.coefficients(degree, texels=texels))
 
     def radiance(
         self, directions: ArrayLike, *, texels: Literal["cells", "samples"] = "cells"

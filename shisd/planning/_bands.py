@@ -13,10 +13,10 @@ from shisd import _checks
 from shisd._typing import Array, Float
 from shisd.harmonics import multiply, sphere_rule
 from shisd.harmonics.internal import host_basis, zonal_norms
-from shisd.models import AbstractBrdf, Environment, PolygonLight, PortalLight
+from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
 from shisd.planning._scene import Light
 from shisd.shading import project_light
-from shisd.shading.internal import RIDGE, hemisphere_blocks, incident_radiance, project_slice
+from shisd.shading.internal import RIDGE, hemisphere_blocks, project_slice
 
 _ELEVATIONS = 12  # of the views whose slices are judged: Gauss nodes
 _AZIMUTHS = 6  # of these views, for anisotropic materials
@@ -30,7 +30,7 @@ class Material:
     shares: np.ndarray  # [V], how much of the picture of a sphere is seen so; their sum is 1
     coloured: bool
     isotropic: bool
-    views: int  # elevations of the tables to be made
+    elevations: int  # of the tables to be made
 
     @property
     def colours(self) -> int:
@@ -75,7 +75,7 @@ class Distant:
 
     coefficients: np.ndarray  # [C, n]
     coloured: bool
-    kind: ClassVar[type] = Environment
+    kind: ClassVar[type] = DistantLight
 
     @property
     def colours(self) -> int:
@@ -136,8 +136,8 @@ class Local:
 Seen = Distant | Local
 
 
-def known_material(brdf: AbstractBrdf, degree: int, views: int) -> Material:
-    """Slices to a degree, seen from Gauss nodes in elevation; `views` as in `Material`."""
+def known_material(brdf: AbstractBrdf, degree: int, elevations: int) -> Material:
+    """Slices to a degree, seen from Gauss nodes in elevation; `elevations` as in `Material`."""
     nodes, weights = np.polynomial.legendre.leggauss(_ELEVATIONS)
     azimuths = np.arange(1 if brdf.isotropic else _AZIMUTHS) / _AZIMUTHS
     theta, phi = (x.ravel() for x in np.meshgrid((nodes + 1) * np.pi / 4, 2 * np.pi * azimuths, indexing="ij"))
@@ -145,7 +145,7 @@ def known_material(brdf: AbstractBrdf, degree: int, views: int) -> Material:
     c = np.asarray(_slices(brdf, jnp.asarray(local, float), degree), float)  # [V, *colour, n]
     shares = np.repeat(weights, len(azimuths)) * np.sin(2 * theta)
     coefficients = np.moveaxis(c.reshape(len(theta), -1, c.shape[-1]), 0, 1)
-    return Material(coefficients, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, views)
+    return Material(coefficients, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, elevations)
 
 
 @eqx.filter_jit
@@ -157,7 +157,7 @@ def _slices(brdf: AbstractBrdf, views: Float[Array, "v 3"], degree: int) -> Floa
 def known_light(name: str, light: Light, points: Any, degree: int) -> Seen:
     """A light to a degree, local ones as `points` [P, 3] see them."""
     if isinstance(light, PolygonLight | PortalLight):
-        incident = incident_radiance(light)  # as a product, without the matrix that shading needs
+        incident = light.incident()  # as a product, without the matrix that shading needs
         light_degree = _checks.degree_of(incident.shape[-1])
         outline = PolygonLight(light.points, two_sided=light.two_sided)
         seen = project_light(outline, points, degree + light_degree)
@@ -165,8 +165,8 @@ def known_light(name: str, light: Light, points: Any, degree: int) -> Seen:
         found = Local(light, _norms(np.asarray(received, float)), light_degree)
     else:
         if isinstance(light, Environment):
-            light = light.coefficients(min(degree, light.texels.shape[0] - 1))
-        e = np.asarray(light, float)[..., : (degree + 1) ** 2]
+            light = light.light(min(degree, light.texels.shape[0] - 1))
+        e = np.asarray(light.coefficients, float)[..., : (degree + 1) ** 2]
         c = np.zeros((*e.shape[:-1], (degree + 1) ** 2))
         c[..., : e.shape[-1]] = e
         found = Distant(c.reshape(-1, c.shape[-1]), c.ndim == 2)

@@ -3,23 +3,22 @@
 import functools
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 
 from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, Float
 from shisd.decomposition.internal import TABLE_DEGREE
-from shisd.models import Environment
 from shisd.planning._bands import Material, Seen, known_light, known_material
 from shisd.planning._paths import PATHS, Irradiance, Path, Table
 from shisd.planning._prediction import Choice, judge
 from shisd.planning._scene import Scene
-from shisd.planning._tables import Tables
+from shisd.shading import Surface, tabulate_brdf
+from shisd.shading.internal import as_type
 
 
 class Entry(NamedTuple):
@@ -53,33 +52,17 @@ class Plan(Module):
     def met(self) -> bool:
         return all(entry.met for entry in self.entries)
 
-    def shade(
-        self,
-        material: str,
-        positions: ArrayLike | None,
-        normals: ArrayLike,
-        views: ArrayLike,
-        tangents: ArrayLike | None = None,
-    ) -> Float[Array, "*batch_colour"]:
+    def shade(self, material: str, surface: Surface) -> Float[Array, "*batch_colour"]:
         """Radiance that leaves surface points of one material towards the viewer, from all lights of the scene.
 
-        Arguments: the name of the `material`; the others and what is returned as in `shading.shade_polygon`;
-        `positions` may be None where no light is local.
-        Derivatives: in positions, normals, views and tangents, both modes. Cost: the sum of the entries.
+        Arguments: the name of the `material`; `surface` and what is returned as in `shading.shade`.
+        Derivatives: in the surface, both modes. Cost: the sum of the entries.
         """
         if material not in self.paths:
             raise ValueError(f"`material` must be one of {', '.join(map(repr, self.paths))}; got {material!r}.")
-        paths = self.paths[material]
-        if positions is None and any(path.takes is not Environment for path in paths):
-            raise ValueError("`positions` [..., 3] are needed: a light of the scene is local.")
-        vectors = {"positions": positions, "normals": normals, "views": views, "tangents": tangents}
-        vectors = {name: _checks.vectors(name, value) for name, value in vectors.items() if value is not None}
-        try:
-            shape = np.broadcast_shapes(*(a.shape for a in vectors.values()))
-        except ValueError as error:
-            shapes = {name: list(a.shape) for name, a in vectors.items()}
-            raise ValueError(f"batch axes {shapes} do not broadcast.") from error
-        return _shade(paths, {name: jnp.broadcast_to(a, shape) for name, a in vectors.items()})
+        if not isinstance(surface, Surface):
+            raise ValueError(f"`surface` must be a shading.Surface; got {type(surface).__name__}.")
+        return _shade(self.paths[material], surface)
 
     def __str__(self) -> str:
         rows = [("material", "light", "path", "degree", "error %", "bound %", "multiply-adds per pixel", "")]
@@ -103,7 +86,7 @@ def plan(
     *,
     max_degree: int = 30,
     margin: float = 1.5,
-    views: int = 64,
+    elevations: int = 64,
     throw: bool = False,
     progress: Progress = None,
 ) -> Plan:
@@ -112,7 +95,7 @@ def plan(
     Arguments: `tolerance` > 0, the relative RMS error: of the radiance from one light, over its RMS, both over normals
     in all directions and views as in the picture of a sphere; every colour has to meet it. Static `max_degree` up to
     64; `margin` >= 1, by which predictions are multiplied before they are compared: real scenes are not turned in all
-    ways. `views`: elevations of the tables, as in `shading.tabulate_brdf`.
+    ways. `elevations` of the tables, as in `shading.tabulate_brdf`.
     Distant lights that take the same path are added up before it, so only the first of them costs anything, and others
     join where they meet the tolerance there.
     Where nothing meets the tolerance, the entry has the best that `max_degree` can do and `met` False, and a
@@ -127,14 +110,15 @@ def plan(
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"`scene` must be a planning.Scene; got {type(scene).__name__}.")
-    max_degree, views = _checks.integer("max_degree", max_degree), _checks.integer("views", views, 4)
+    max_degree = _checks.integer("max_degree", max_degree)
+    elevations = _checks.integer("elevations", elevations, 4)
     if max_degree > TABLE_DEGREE:
         raise ValueError(f"`max_degree` must be <= {TABLE_DEGREE}; got {max_degree}.")
     tolerance, margin = _checks.number("tolerance", tolerance, positive=True), _checks.number("margin", margin)
     if margin < 1:
         raise ValueError(f"`margin` must be >= 1; got {margin}.")
     with reporting(progress, len(scene.lights) + len(scene.materials), "plan") as step:
-        made = _plan(scene, tolerance, margin, max_degree, views, step)
+        made = _plan(scene, tolerance, margin, max_degree, elevations, step)
     if not made.met:
         failed = [f"{e.material} under {e.light} ({100 * e.error:.2g} %)" for e in made.entries if not e.met]
         message = (
@@ -148,7 +132,7 @@ def plan(
 
 
 def _plan(
-    scene: Scene, tolerance: float, margin: float, max_degree: int, views: int, step: Callable[..., object]
+    scene: Scene, tolerance: float, margin: float, max_degree: int, elevations: int, step: Callable[..., object]
 ) -> Plan:
     reference = max(32, 2 * max_degree)
     lights = {}
@@ -157,10 +141,10 @@ def _plan(
         step()
     entries, paths = [], {}
     for name, brdf in scene.materials.items():
-        material = known_material(brdf, reference, views)
+        material = known_material(brdf, reference, elevations)
         choices = {of: _choose(material, light, tolerance / margin, max_degree) for of, light in lights.items()}
         choices, hosts = _join(material, lights, choices, tolerance / margin)
-        tables = Tables(brdf, max(c.degree for c in choices.values()), views)
+        slices = as_type(tabulate_brdf(brdf, max(c.degree for c in choices.values()), elevations=elevations), float)
         for of, choice in choices.items():
             alone = hosts[of] == of
             cost, joined = (choice.cost, "") if alone else (0.0, hosts[of])
@@ -169,7 +153,7 @@ def _plan(
                 Entry(name, of, choice.name(material), choice.degree, choice.error, choice.bound, cost, joined, met)
             )
         paths[name] = tuple(
-            choice.path.make(material, tables, [lights[of] for of in choices if hosts[of] == host], choice.degree)
+            choice.path.make(material, slices, [lights[of] for of in choices if hosts[of] == host], choice.degree)
             for host, choice in choices.items()
             if hosts[host] == host
         )
@@ -208,8 +192,7 @@ def _join(
 
 
 @eqx.filter_jit
-def _shade(paths: tuple[Path, ...], vectors: dict[str, Array]) -> Float[Array, "*batch_colour"]:
-    everything: dict[str, Any] = {"positions": None, "tangents": None} | vectors
-    values = [path.shade(**everything) for path in paths]
+def _shade(paths: tuple[Path, ...], surface: Surface) -> Float[Array, "*batch_colour"]:
+    values = [path.shade(surface) for path in paths]
     most = max(value.ndim for value in values)
     return functools.reduce(jnp.add, (v.reshape(*v.shape, *(1,) * (most - v.ndim)) for v in values))

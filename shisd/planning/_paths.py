@@ -10,10 +10,9 @@ import numpy as np
 from shisd._module import Module
 from shisd._typing import Array, Float
 from shisd.harmonics import convolve, evaluate
-from shisd.models import Environment, PolygonLight, PortalLight
+from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
 from shisd.planning._bands import Distant, Local, Material
-from shisd.planning._tables import Tables
-from shisd.shading import Slices, shade_environment, shade_polygon, shade_portal, shade_zonal
+from shisd.shading import Slices, Surface, shade
 
 
 class Path(Module):
@@ -37,19 +36,19 @@ class Path(Module):
 
     @classmethod
     @abc.abstractmethod
-    def make(cls, material: Material, tables: Tables, lights: list, degree: int) -> "Path":
-        """The path, ready to be called."""
+    def make(cls, material: Material, slices: Slices, lights: list, degree: int) -> "Path":
+        """The path, ready to be called; `slices` of this degree or a higher one."""
 
     @abc.abstractmethod
-    def shade(self, positions: Any, normals: Array, views: Array, tangents: Array | None) -> Array:
-        """Radiance [..., *colour]; `positions` are None where no light is local."""
+    def shade(self, surface: Surface) -> Array:
+        """Radiance [..., *colour]."""
 
 
 class Irradiance(Path):
     """Slices that are zonal about the normal and the same from all sides, of matt materials: the light convolved."""
 
     name = "irradiance"
-    takes = Environment
+    takes = DistantLight
     coefficients: Float[Array, "*colour n"]
 
     @staticmethod
@@ -62,27 +61,28 @@ class Irradiance(Path):
         return float(max(material.colours, light.colours) * (degree + 1) * (2 * degree + 1))
 
     @classmethod
-    def make(cls, material, tables, lights, degree):
+    def make(cls, material, slices, lights, degree):
         kernel = material.mean_zonal[:, : degree + 1]
         kernel, e = jnp.asarray(kernel, float), _sum(lights, degree)
         c = convolve(e, kernel if material.coloured or e.ndim == 2 else kernel[0])
         return cls(c)
 
-    def shade(self, positions, normals, views, tangents):
+    def shade(self, surface):
+        there = True if surface.mask is None else surface.mask[..., None]
+        normals = jnp.where(there, surface.normals, jnp.asarray([0, 0, 1], surface.normals.dtype))
         c = self.coefficients.reshape(-1, 1, self.coefficients.shape[-1])
         values = evaluate(c, normals.reshape(-1, 3)).T.reshape(*normals.shape[:-1], *self.coefficients.shape[:-1])
-        below = jnp.sum(normals * views, axis=-1) < 0
-        return jnp.where(below.reshape(*below.shape, *(1,) * (values.ndim - below.ndim)), 0, values)
+        dark = (jnp.sum(normals * surface.views, axis=-1) < 0) | ~jnp.squeeze(jnp.asarray(there)[..., None], -1)
+        return jnp.where(dark.reshape(*dark.shape, *(1,) * (values.ndim - dark.ndim)), 0, values)
 
 
 class Zonal(Path):
     """Distant light that is symmetric about an axis: nothing is rotated."""
 
     name = "zonal light"
-    takes = Environment
+    takes = DistantLight
     slices: Slices
-    axis: Float[Array, "3"]
-    coefficients: Float[Array, "*colour l"]
+    light: ZonalLight
 
     @staticmethod
     def left_out(material, light, degree):
@@ -95,22 +95,22 @@ class Zonal(Path):
         return _lookup_cost(material, degree) + n * (2 * (degree + 1) + max(material.colours, light.colours))
 
     @classmethod
-    def make(cls, material, tables, lights, degree):
+    def make(cls, material, slices, lights, degree):
         (light,) = lights
         z = jnp.asarray(light.zonal[:, : degree + 1], float)
-        return cls(tables.slices(degree), jnp.asarray(light.axis, float), z if light.coloured else z[0])
+        return cls(slices.cut(degree), ZonalLight(jnp.asarray(light.axis, float), z if light.coloured else z[0]))
 
-    def shade(self, positions, normals, views, tangents):
-        return shade_zonal(self.slices, self.axis, self.coefficients, normals, views, tangents)
+    def shade(self, surface):
+        return shade(self.slices, self.light, surface)
 
 
 class Table(Path):
     """Any distant light, turned to the frame of every pixel and multiplied with the slice of its view."""
 
     name = "table"
-    takes = Environment
+    takes = DistantLight
     slices: Slices
-    coefficients: Float[Array, "*colour n"]
+    light: DistantLight
 
     @staticmethod
     def left_out(material, light, degree):
@@ -124,11 +124,11 @@ class Table(Path):
         return _lookup_cost(material, degree) + series * (colours + material.isotropic) + material.colours * exchange
 
     @classmethod
-    def make(cls, material, tables, lights, degree):
-        return cls(tables.slices(degree), _sum(lights, degree))
+    def make(cls, material, slices, lights, degree):
+        return cls(slices.cut(degree), DistantLight(_sum(lights, degree)))
 
-    def shade(self, positions, normals, views, tangents):
-        return shade_environment(self.slices, self.coefficients, normals, views, tangents)
+    def shade(self, surface):
+        return shade(self.slices, self.light, surface)
 
 
 class AboveHorizon(Path):
@@ -142,8 +142,11 @@ class AboveHorizon(Path):
         return material.misfit(degree), light.norms
 
     @classmethod
-    def make(cls, material, tables, lights, degree):
-        return cls(tables.slices(degree, above=True), lights[0].light)
+    def make(cls, material, slices, lights, degree):
+        return cls(slices.cut(degree).above_horizon(), lights[0].light)
+
+    def shade(self, surface):
+        return shade(self.slices, self.light, surface)
 
 
 class Polygon(AboveHorizon):
@@ -161,9 +164,6 @@ class Polygon(AboveHorizon):
         weights = rows * axes
         return _lookup_cost(material, degree) + material.colours * (moments + weights)
 
-    def shade(self, positions, normals, views, tangents):
-        return shade_polygon(self.slices, self.light, positions, normals, views, tangents)
-
 
 class Portal(AboveHorizon):
     """Distant light through a window."""
@@ -174,9 +174,6 @@ class Portal(AboveHorizon):
     @staticmethod
     def cost(material, light, degree):
         return _product_cost(material, light, degree)
-
-    def shade(self, positions, normals, views, tangents):
-        return shade_portal(self.slices, self.light, positions, normals, views, tangents)
 
 
 PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal)
@@ -191,7 +188,7 @@ def _sum(lights: list[Distant], degree: int) -> Float[Array, "*colour n"]:
 
 def _lookup_cost(material: Material, degree: int) -> float:
     azimuths = 1 if material.isotropic else max(32, 2 * degree + 4) + 2  # cosines and sines
-    return float(material.colours * (material.views + 4) * azimuths * _axes_and_rows(material, degree)[1])
+    return float(material.colours * (material.elevations + 4) * azimuths * _axes_and_rows(material, degree)[1])
 
 
 def _axes_and_rows(material: Material, degree: int) -> tuple[int, int]:

@@ -3,18 +3,17 @@
 from shisd import _checks
 from shisd._module import Module
 from shisd._typing import Array, ArrayLike, Float
-from shisd.models import AbstractBrdf, Environment, PolygonLight, PortalLight
+from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
 
-Light = Environment | PolygonLight | PortalLight | ArrayLike
+Light = DistantLight | Environment | PolygonLight | PortalLight
 
 
 class Scene(Module):
     """What is to be shaded: every material under the sum of all lights, without occlusion.
 
-    Arguments: `materials` and `lights` by name; a light is a `models.Environment`, SH coefficients [n] or [colour, n]
-    of distant light, a `models.PolygonLight` or a `models.PortalLight`; `points`
-    [N, 3], representative positions of surfaces, which judge the local lights. A dozen will do: each costs a
-    projection.
+    Arguments: `materials` and `lights` by name; a light is a `models.DistantLight`, an `Environment`, a
+    `PolygonLight` or a `PortalLight`; `points` [N, 3], representative positions of surfaces, which judge the local
+    lights. A dozen will do: each costs a projection.
     """
 
     materials: dict[str, AbstractBrdf]
@@ -33,8 +32,11 @@ class Scene(Module):
             if isinstance(light, PolygonLight | PortalLight):
                 if points is None:
                     raise ValueError(f"`lights`[{name!r}] is local; pass `points` [N, 3] that see it.")
-            elif not isinstance(light, Environment):
-                _checks.expansion(f"lights[{name!r}]", light)
+            elif not isinstance(light, DistantLight | Environment):
+                raise ValueError(
+                    f"`lights`[{name!r}] must be a models.DistantLight, Environment, PolygonLight or PortalLight; got "
+                    f"{type(light).__name__}."
+                )
         self.materials, self.lights = dict(materials), dict(lights)
         self.points = None if points is None else _checks.vectors("points", points).reshape(-1, 3)
         if self.points is not None and len(self.points) == 0:

@@ -19,7 +19,7 @@ from shisd import _checks
 from shisd._module import Module
 from shisd._numerics import normalize
 from shisd._typing import Array, ArrayLike, Float
-from shisd.shading._surface import frame
+from shisd.shading._frames import frame
 
 _OFF_PLANE = 0.5  # sine of the angle to either tangent plane from which on a neighbour is on another surface
 _RIDGE = 1e-5  # relative, of least squares: what no neighbour tells becomes 0
@@ -33,7 +33,7 @@ def _axes(name: str, value: ArrayLike) -> Array:
     return axes
 
 
-class MirrorFootprint(Module):
+class Footprint(Module):
     """Mirror directions of pixels, and how these spread over the pixel's filter, a Gaussian.
 
     `directions` [..., 3], unit; `axes` [..., 3, 2], the change of direction over one standard deviation of the filter
@@ -53,7 +53,7 @@ class MirrorFootprint(Module):
         position_derivatives: ArrayLike,
         *,
         filter_width: ArrayLike = 0.5,
-    ) -> "MirrorFootprint":
+    ) -> "Footprint":
         """Footprints where normals and positions are known as functions of the pixel.
 
         Arguments: `normals` and `positions` [..., 3], normals of any length; `eye` [3]; their derivatives by column and
@@ -75,9 +75,9 @@ class MirrorFootprint(Module):
         return _footprint(n, x, e, dn, dx, width.astype(dtype))
 
 
-def mirror_footprint(
+def footprint(
     normals: ArrayLike, positions: ArrayLike, eye: ArrayLike, seen: ArrayLike, *, filter_width: ArrayLike = 0.5
-) -> MirrorFootprint:
+) -> Footprint:
     """Footprints of the pixels of a picture of mirrors, from its images of normals and positions.
 
     The shape operator is fitted to the normals and positions of a pixel and its seen neighbours, as a symmetric matrix
@@ -115,19 +115,19 @@ def _eye(eye: ArrayLike) -> Float[Array, "3"]:
 
 
 @jax.jit
-def _footprint(n: Array, x: Array, eye: Array, dn: Array, dx: Array, width: Array) -> MirrorFootprint:
+def _footprint(n: Array, x: Array, eye: Array, dn: Array, dx: Array, width: Array) -> Footprint:
     def mirrored(n: Array, x: Array) -> Array:
         n, o = normalize(n), normalize(eye - x)
         return 2 * jnp.sum(n * o, axis=-1, keepdims=True) * n - o
 
     (r, by_column), (_, by_row) = (jax.jvp(mirrored, (n, x), (dn[..., i], dx[..., i])) for i in range(2))
-    return MirrorFootprint(r, width * jnp.stack([by_column, by_row], axis=-1))
+    return Footprint(r, width * jnp.stack([by_column, by_row], axis=-1))
 
 
 @jax.jit
 def _from_images(
     n: Float[Array, "h w 3"], x: Float[Array, "h w 3"], eye: Float[Array, "3"], seen: Array, width: Array
-) -> MirrorFootprint:
+) -> Footprint:
     away, eye = jnp.asarray([[[0, 0, 1]]], n.dtype), eye[None, None]
     n, x = (jnp.where(seen[..., None], a, b) for a, b in ((n, away), (x, eye + away)))
     n = normalize(n)

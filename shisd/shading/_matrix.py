@@ -13,6 +13,7 @@ cos(m phi) = y_l'^m(wo) for m > 0; T_k = Chebyshev polynomials, cos(k theta) = T
 """
 
 import functools
+from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
@@ -25,17 +26,14 @@ from shisd import _checks
 from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import angle_multiples, safe_sqrt
-from shisd._sharding import by_device
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import sh_basis
 from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
-from shisd.shading._environment import shade_slices
-from shisd.shading._surface import shade_points, surface
 from shisd.shading.slices._slices import Slices, check_domain, products_in_order
 from shisd.shading.slices._tabulate import by_convergence, slices_at
-from shisd.shading.slices._upper import RIDGE
+from shisd.shading.slices._upper import RIDGE, fit_above
 
 _VIEW_RIDGE = 1e-10  # of fits over views
 
@@ -80,9 +78,9 @@ class BrdfMatrix(Module):
         return jnp.einsum("...ij,j->...i", self.matrix(), sh_basis(view, self.view_degree))
 
     @method
-    def slices(self, *, views: int = 64, azimuths: int | None = None) -> Slices:
-        """These slices as a table of `views` elevations and, of anisotropic materials, `azimuths` (None: enough)."""
-        theta = _views.elevations(_checks.integer("views", views, 4))
+    def slices(self, *, elevations: int = 64, azimuths: int | None = None) -> Slices:
+        """These slices as a table of views at `elevations` and, of anisotropic materials, `azimuths` (None: enough)."""
+        theta = _views.elevations(_checks.integer("elevations", elevations, 4))
         azimuths = _azimuths(self.degree, self.view_degree) if azimuths is None else azimuths
         phi = 2 * np.pi * np.arange(_checks.integer("azimuths", azimuths, 1)) / azimuths
         grid = np.meshgrid(theta, phi[:1] if self.isotropic else phi, indexing="ij")
@@ -131,7 +129,9 @@ def _project(
 ) -> tuple[tuple[Array, ...], Scalar]:
     azimuths = _azimuths(degree, view_degree)
     z, _ = _view_nodes(view_degree)
-    c, error = slices_at(np.arccos(z), brdf, degree, dtype, azimuths, quadrature, ridge)
+    c, error = slices_at(np.arccos(z), brdf, degree, dtype, azimuths, quadrature, (ridge,))
+    if ridge is not None:
+        c = fit_above(c, ridge)
 
     def fitted(samples: Float[Array, "*batch v n"], m: int) -> Float[Array, "*batch n k"]:
         to_modes, to_coefficients = (jnp.asarray(a, dtype) for a in _view_fit(view_degree, m))
@@ -183,53 +183,13 @@ def _view_fit(view_degree: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     return np.sqrt(weight)[:, None] * u, (s / (s * s + _VIEW_RIDGE))[:, None] * v
 
 
-# ---- Radiance
-
-
-def shade_matrix(
-    matrix: BrdfMatrix,
-    light_coefficients: ArrayLike,
-    normals: ArrayLike,
-    views: ArrayLike,
-    tangents: ArrayLike | None = None,
-    *,
-    mask: ArrayLike | None = None,
-) -> Float[Array, "*batch_colour"]:
-    """Radiance that leaves surface points towards the viewer under distant light: `shade_environment` with a matrix.
-
-    Arguments: `matrix` from `project_brdf` with domain="sphere"; the others, `mask` too, and what is returned as in
-    `shade_environment`.
-    Derivatives: in every floating argument, both modes; the first exact for views along the normal as well, second ones
-    not there. The cut at the horizon is a discontinuity of the view, with no gradient.
-    Accuracy: exact for the slices of the matrix, to 1e-5 of the largest radiance in float32 and 1e-12 in float64.
-    Cost: as `shade_environment`, with Lv + 1 numbers per coefficient of a slice to multiply, instead of V + 4, which
-    are not what takes long; for anisotropic materials (Lv + 1)^2 instead of (V + 4) (2 L + 6), which are: at degree 8
-    a third of its time, with gradients too, for Lv = 16 and V = 32.
-    Source: CSH18 section 5.1; ISD15 Eq. 20-22.
-    """
-    if not isinstance(matrix, BrdfMatrix):
-        raise ValueError(f"`matrix` must come from shading.project_brdf; got {type(matrix).__name__}.")
-    if matrix.domain != "sphere":
-        raise ValueError("`matrix` was fitted above the horizon only; project the material with domain='sphere'.")
-    e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
-    light = [("light_coefficients", e.shape[:-1])]
-    matrix, points, colour = surface("matrix", matrix, tangents, light, [e.dtype], mask, normals=normals, views=views)
-    e = e[..., : (min(light_degree, matrix.degree) + 1) ** 2].astype(matrix.blocks[0].dtype)
-    return by_device(shade_points, points, _shade, matrix, e, colour)
-
-
-@eqx.filter_jit
-def _shade(
-    points: dict[str, Float[Array, "p 3"]], matrix: BrdfMatrix, e: Float[Array, "*c n"], colour: tuple[int, ...]
-) -> Float[Array, " p *colour"]:
-    degree = _checks.degree_of(e.shape[-1])
+def matrix_orders(matrix: BrdfMatrix, degree: int) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:
+    """`BrdfMatrix.at` of many views up to `degree`, as `slices.slice_orders`."""
     if matrix.isotropic:
         factors = lambda view: _chebyshev(view, matrix.view_degree)
-        look_up = products_in_order(_polar_table(matrix, degree), degree, factors, _waves)
-    else:
-        table = matrix.blocks[0][..., : (degree + 1) ** 2, :]
-        look_up = products_in_order(table, degree, lambda view: sh_basis(view, matrix.view_degree).T, None)
-    return shade_slices(points, matrix, look_up, e, colour)
+        return products_in_order(_polar_table(matrix, degree), degree, factors, _waves)
+    table = matrix.blocks[0][..., : (degree + 1) ** 2, :]
+    return products_in_order(table, degree, lambda view: sh_basis(view, matrix.view_degree).T, None)
 
 
 def _polar_table(matrix: BrdfMatrix, degree: int) -> Float[Array, "*colour n k"]:

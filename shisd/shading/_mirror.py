@@ -34,43 +34,15 @@ from shisd.harmonics.internal import (
     turned_series,
     zonal_norms,
 )
-from shisd.shading._footprint import MirrorFootprint
-from shisd.shading._surface import as_type, finite_mark, finite_or_nan, frame, in_tiles, masks, shade_points
+from shisd.models import DistantLight
+from shisd.shading._footprint import Footprint
+from shisd.shading._frames import frame
+from shisd.shading._surface import bools
+from shisd.shading._tiles import as_type, finite_mark, finite_or_nan, in_tiles, shade_points
 
 _NUMBERS_AT_ONCE = 1 << 18  # coefficients of footprints in a tile
 
 Points = dict[str, Float[Array, "p 3"]]
-
-
-def shade_mirror(
-    footprint: MirrorFootprint,
-    light_coefficients: ArrayLike,
-    *,
-    anisotropic: bool = False,
-    mask: ArrayLike | None = None,
-) -> Float[Array, "*batch_colour"]:
-    """Radiance of perfect mirrors under distant light, filtered over the footprint of each pixel.
-
-    Arguments: `footprint` [...]; `light_coefficients` [*colour, n], SH coefficients in world space; static
-    `anisotropic`: the Gaussian as it is, or a round one of the same mean variance (option 3 of ISD15 section 6.2, its
-    choice; the other is option 1); `mask` [...] as in `shade_environment`. Returns [..., *colour], in the light's unit.
-    NaN in a footprint gives NaN, with NaN gradients.
-    Derivatives: in every floating argument, both modes, also where the footprint is round or a point. Those of second
-    order are NaN at mirror directions along the z axis.
-    Accuracy: against a Gaussian carried to the sphere, relative to the light, 0.06 of its variance, anisotropic 0.15,
-    beside the rounding of `harmonics.evaluate`. The round one leaves out the shape: 20 % where C is sixteen to one.
-    Light that is cut off at a degree L rings around lamps wherever footprints are narrower than about 3 / L: take a
-    higher degree, a window (`harmonics.hann_window`), or `shade_prefiltered_mirror`.
-    Cost: two thirds of the sum over `harmonics.sh_basis` from degree 30 on, 1.5 of it at 16; anisotropic, about L^3
-    products, as in `shade_environment`.
-    Memory: one tile of at most 512 pixels, and the result.
-    Source: ISD15 Eq. 28, 22 and 29.
-    """
-    points, dtype = _points(footprint, mask)
-    e, _ = _checks.expansion("light_coefficients", light_coefficients)
-    dtype = jnp.promote_types(dtype, e.dtype)
-    points, e = as_type((points, e), dtype)
-    return by_device(shade_points, points, _anisotropic if anisotropic else _isotropic, e)
 
 
 class MirrorMaps(Module):
@@ -83,61 +55,80 @@ class MirrorMaps(Module):
     variances: Float[Array, " levels"]
     colour: tuple[int, ...] = eqx.field(static=True)
 
+    @classmethod
+    def from_texels(cls, texels: ArrayLike, *, levels: int = 13, degree: int | None = None) -> "MirrorMaps":
+        """Filter a map with Gaussians of a few widths, once for any number of pixels: see `reflect`.
 
-def prefilter_mirror(texels: ArrayLike, *, levels: int = 13, degree: int | None = None) -> MirrorMaps:
-    """Filter a map with Gaussians of a few widths, once for any number of pixels: see `shade_prefiltered_mirror`.
-
-    Arguments: `texels` [H, 2H] or [H, 2H, colour] as in `harmonics.project_map`; static `levels` >= 2, the map itself
-    and widths from 3 / degree, at most 0.5, to 1 rad in equal ratios; static `degree` at which the map is filtered, by
-    default H - 1, at most 255.
-    Derivatives: linear in the texels. Cost: one projection, and a synthesis for each level.
-    """
-    texels, levels = _checks.real_array("texels", texels), _checks.integer("levels", levels, minimum=2)
-    if texels.ndim not in (2, 3) or texels.shape[1] != 2 * texels.shape[0] or 0 in texels.shape:
-        raise ValueError(f"`texels` must have shape [H, 2H] or [H, 2H, colour]; got {list(texels.shape)}.")
-    degree = min(len(texels) - 1, 255) if degree is None else _checks.degree(degree)
-    variances = np.concatenate([[0], np.geomspace(min(3 / max(degree, 1), 0.5), 1, levels - 1) ** 2])
-    e = project_map(texels, degree).reshape(-1, 1, (degree + 1) ** 2)
-    kept = jnp.asarray(np.exp(-np.outer(variances[1:], _half_eigenvalues(degree)))[:, bands(degree)], e.dtype)
-    filtered = synthesize_map(jnp.swapaxes(e * kept[None], 0, 1), len(texels))
-    maps = jnp.concatenate([texels.reshape(*texels.shape[:2], 1, -1), filtered], axis=2)
-    return MirrorMaps(maps, jnp.asarray(variances, maps.dtype), texels.shape[2:])
+        Arguments: `texels` [H, 2H] or [H, 2H, colour] as in `harmonics.project_map`; static `levels` >= 2, the map
+        itself and widths from 3 / degree, at most 0.5, to 1 rad in equal ratios; static `degree` at which the map is
+        filtered, by default H - 1, at most 255.
+        Derivatives: linear in the texels. Cost: one projection, and a synthesis for each level.
+        """
+        texels, levels = _checks.real_array("texels", texels), _checks.integer("levels", levels, minimum=2)
+        if texels.ndim not in (2, 3) or texels.shape[1] != 2 * texels.shape[0] or 0 in texels.shape:
+            raise ValueError(f"`texels` must have shape [H, 2H] or [H, 2H, colour]; got {list(texels.shape)}.")
+        degree = min(len(texels) - 1, 255) if degree is None else _checks.degree(degree)
+        variances = np.concatenate([[0], np.geomspace(min(3 / max(degree, 1), 0.5), 1, levels - 1) ** 2])
+        e = project_map(texels, degree).reshape(-1, 1, (degree + 1) ** 2)
+        kept = jnp.asarray(np.exp(-np.outer(variances[1:], _half_eigenvalues(degree)))[:, bands(degree)], e.dtype)
+        filtered = synthesize_map(jnp.swapaxes(e * kept[None], 0, 1), len(texels))
+        maps = jnp.concatenate([texels.reshape(*texels.shape[:2], 1, -1), filtered], axis=2)
+        return cls(maps, jnp.asarray(variances, maps.dtype), texels.shape[2:])
 
 
-def shade_prefiltered_mirror(
-    footprint: MirrorFootprint, maps: MirrorMaps, *, mask: ArrayLike | None = None
+def reflect(
+    footprint: Footprint, light: DistantLight | MirrorMaps, *, anisotropic: bool = False, mask: ArrayLike | None = None
 ) -> Float[Array, "*batch_colour"]:
-    """Radiance of perfect mirrors under a filtered map: 13 lookups for each pixel, whatever the footprint and degree.
+    """Radiance of perfect mirrors under distant light, filtered over the footprint of each pixel.
 
-    The footprint is a sum of round Gaussians of variance det C / tau, near that of its narrow side, about directions
-    that are displaced by C z / sqrt(tau), whose covariance C^2 / tau is the rest of C. The z are those of a rule of
-    degree 5 for Gaussians in space: the centre and the vertices of an icosahedron.
-    Arguments: `footprint` [...]; `maps` from `prefilter_mirror`; `mask` [...] as in `shade_environment`. Returns
-    [..., *colour]. NaN in a footprint gives NaN, with NaN gradients.
-    Derivatives: in all, both modes, also where the footprint is round or a point; those in directions jump between
-    texels, as in `harmonics.sample_map`, and those in variances between levels.
-    Accuracy: that of the lookups, and of the rule: 0.4 % of the light for a C of four to one, 7 % for sixteen, 17 % for
-    a hundred to one. A narrow side wider than 1 rad is cut to that.
-    Source: ISD15 Eq. 17 and 28, option 2 of section 6.2.
+    Arguments: `footprint` [...]; `light`, a `models.DistantLight`, or `MirrorMaps` of a map; `mask` [...] as in
+    `Surface`. Returns [..., *colour], in the light's unit. NaN in a footprint gives NaN, with NaN gradients.
+
+    With a `DistantLight` the Gaussian meets the light's harmonics (Eq. 28, 22 and 29). Static `anisotropic`: as it is,
+    or a round one of the same mean variance (option 3 of ISD15 section 6.2, its choice; the other is option 1).
+    Accuracy: against a Gaussian carried to the sphere, relative to the light, 0.06 of its variance, anisotropic 0.15,
+    beside the rounding of `harmonics.evaluate`. The round one leaves out the shape: 20 % where C is sixteen to one.
+    Light that is cut off at a degree L rings around lamps wherever footprints are narrower than about 3 / L: take a
+    higher degree, a window (`harmonics.hann_window`), or maps. Cost: two thirds of the sum over `harmonics.sh_basis`
+    from degree 30 on, 1.5 of it at 16; anisotropic, about L^3 products. Memory: one tile of at most 512 pixels.
+
+    With `MirrorMaps` (Eq. 17 and 28, option 2) it is 13 lookups for each pixel, whatever the footprint and degree. The
+    footprint is a sum of round Gaussians of variance det C / tau, near that of its narrow side, about directions that
+    are displaced by C z / sqrt(tau), whose covariance C^2 / tau is the rest of C. The z are those of a rule of degree 5
+    for Gaussians in space: the centre and the vertices of an icosahedron. Accuracy: that of the lookups, and of the
+    rule: 0.4 % of the light for a C of four to one, 7 % for sixteen, 17 % for a hundred to one. A narrow side wider
+    than 1 rad is cut to that.
+
+    Derivatives: in every floating argument, both modes, also where the footprint is round or a point. With light as
+    coefficients those of second order are NaN at mirror directions along the z axis; with maps those in directions jump
+    between texels, as in `harmonics.sample_map`, and those in variances between levels.
     """
     points, dtype = _points(footprint, mask)
-    if not isinstance(maps, MirrorMaps):
-        raise ValueError(f"`maps` must come from shading.prefilter_mirror; got {type(maps).__name__}.")
-    dtype = jnp.promote_types(dtype, maps.texels.dtype)
-    points, maps = as_type((points, maps), dtype)
-    return by_device(shade_points, points, _from_maps, maps)
+    if isinstance(light, MirrorMaps):
+        if anisotropic:
+            raise ValueError("`anisotropic` belongs to a DistantLight: MirrorMaps always follow the footprint's shape.")
+        dtype = jnp.promote_types(dtype, light.texels.dtype)
+        return by_device(shade_points, as_type(points, dtype), _from_maps, as_type(light, dtype))
+    if not isinstance(light, DistantLight):
+        raise ValueError(f"`light` must be a models.DistantLight or shading.MirrorMaps; got {type(light).__name__}.")
+    dtype = jnp.promote_types(dtype, light.coefficients.dtype)
+    path = _anisotropic if anisotropic else _isotropic
+    return by_device(shade_points, as_type(points, dtype), path, light.coefficients.astype(dtype))
 
 
 # ---- light as coefficients
 
 
 def _points(footprint: object, mask: ArrayLike | None) -> tuple[dict[str, Array], jnp.dtype]:
-    if not isinstance(footprint, MirrorFootprint):
-        raise ValueError(f"`footprint` must come from shading.mirror_footprint; got {type(footprint).__name__}.")
+    if not isinstance(footprint, Footprint):
+        raise ValueError(f"`footprint` must come from shading.footprint; got {type(footprint).__name__}.")
     d, axes = _checks.vectors("footprint.directions", footprint.directions), footprint.axes
     if axes.shape != (*d.shape, 2):
         raise ValueError(f"`footprint.axes` must have shape {[*d.shape, 2]}; got {list(axes.shape)}.")
-    points, masked = {"directions": d, "along_columns": axes[..., 0], "along_rows": axes[..., 1]}, masks(mask)
+    points, masked = (
+        {"directions": d, "along_columns": axes[..., 0], "along_rows": axes[..., 1]},
+        {} if mask is None else {"mask": bools(mask)[..., None]},
+    )
     try:
         np.broadcast_shapes(*(a.shape for a in (points | masked).values()))
     except ValueError as error:

@@ -30,18 +30,21 @@ from shisd import _checks
 from shisd._module import Module
 from shisd._numerics import arctan2, normalize, safe_sqrt
 from shisd._sharding import by_device
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, Float, Scalar
 from shisd.harmonics.internal import bands, quarter_mirror, swap_matrices
+from shisd.models import DistantLight
 from shisd.shading import _views
-from shisd.shading._surface import as_type, finite_mark, finite_or_nan, in_tiles, masks, shade_points
-from shisd.shading.slices._slices import Slices, check_slices
+from shisd.shading._material import Material, as_material, slices_everywhere
+from shisd.shading._surface import Surface, check_surface
+from shisd.shading._tiles import as_type, finite_mark, finite_or_nan, in_tiles, shade_points
+from shisd.shading.slices._slices import Slices
 
 _TILE, _NUMBERS_AT_ONCE = 1 << 14, 1 << 21  # pixels, and values of all channels for them, at a time
 DARK = 1e-12  # of the brightest colour's mean square: what is below is rounding
 _ROWS_PER_BAND = 3  # texels from pole to pole for each band: cubic splines are then good to 1e-3 of the highest one
 
 
-class PrefilteredLobes(Module):
+class Prefiltered(Module):
     """A material under one distant light, as `prefilter` makes it: `channels` terms, predicted relative `error`.
 
     `maps` [texels, M * colours], splines of U and V over two charts, and `profiles` [V+4, M * colours], those of a over
@@ -65,36 +68,50 @@ class PrefilteredLobes(Module):
     def degree(self) -> int:
         return self.expand.shape[1] - 1
 
+    def radiance(self, surface: Surface) -> Float[Array, "*batch_colour"]:
+        """Radiance [..., *colour] that leaves surface points towards the viewer, as `shade` gives it.
+
+        Derivatives: in normals, views and tables, both modes; twice continuous in directions, where the chart changes
+        up to the error of the splines.
+        Accuracy: that of `prefilter`, and 1e-3 of the highest bands, whatever the degree.
+        Cost: 16 texels of all channels; nothing depends on the degree.
+        """
+        check_surface(surface)
+        points = surface.points("normals", "views")
+        dtype = jnp.result_type(self.maps, points["normals"], points["views"])
+        return by_device(shade_points, as_type(points, dtype), _shade, as_type(self, dtype))
+
 
 def prefilter(
-    material: Slices, light_coefficients: ArrayLike, *, tolerance: float = 1e-2, like: PrefilteredLobes | None = None
-) -> PrefilteredLobes:
-    """Filter distant light for one isotropic material, once for any number of pixels: see `shade_prefiltered`.
+    material: Material | Slices, light: DistantLight, *, tolerance: float = 1e-2, like: Prefiltered | None = None
+) -> Prefiltered:
+    """Filter distant light for one isotropic material, once for any number of pixels: see `Prefiltered.radiance`.
 
-    Arguments: `material` and `light_coefficients` as in `shade_environment`; static `tolerance`, the error to aim at:
-    that of radiance relative to its RMS over all orientations and over the views of a sphere, of the worst colour,
-    against `shade_environment`. As many channels are kept as that takes; `error` of the result is what is predicted for
+    Arguments: `material` as in `shade`, and a `models.DistantLight`; static `tolerance`, the error to aim at: that of
+    radiance relative to its RMS over all orientations and over the views of a sphere, of the worst colour, against
+    `shade`. As many channels are kept as that takes; `error` of the result is what is predicted for
     it, and tests find it right within a factor of 2 on photographed maps.
     Channels are chosen from values, so not under jit, grad or vmap. There pass `like`, an earlier result: its channels
-    are used again and only the tables are made, a pure function of `material` and `light_coefficients`, linear in each.
+    are used again and only the tables are made, a pure function of `material` and `light`, linear in each.
     `error` is then that of its channels for this material and this light, and nothing holds it below `tolerance`:
     channels chosen for GGX of alpha 0.4 at 1e-2 leave 2.3e-2 at alpha 0.3 and 0.15 at 0.8, at degree 6.
     Derivatives: with `like`, in both; those of channels that stay as they are. So a fit of the light is as good as its
     values, but the slope in a material's roughness lacks what would need other channels, and a fit by it may end beside
-    the best one: fit materials by `shade_environment`, whose derivatives are exact, and filter what was found. Read
+    the best one: fit materials by `shade`, whose derivatives are exact, and filter what was found. Read
     `error` wherever material or light have moved, and choose anew where it has grown.
     Cost: the maps hold 18 (L+1)^2 texels; each is a Fourier series, summed over rows, then over columns.
     Source: ISD15 Eq. 22, whose zonal maps this extends to orders m > 0.
     """
-    check_slices(material, everywhere=True)
-    if not material.isotropic:
-        raise ValueError("`material` is anisotropic, which no map of one direction can hold; use shade_environment.")
-    e, light_degree = _checks.expansion("light_coefficients", light_coefficients)
+    slices = slices_everywhere(as_material(material), "DistantLight")
+    if not slices.isotropic:
+        raise ValueError("`material` is anisotropic, which no map of one direction can hold; use shading.shade.")
+    if not isinstance(light, DistantLight):
+        raise ValueError(f"`light` must be a models.DistantLight; got {type(light).__name__}.")
     tolerance = _checks.number("tolerance", tolerance, positive=True)
-    degree = min(light_degree, material.degree)
-    dtype = jnp.promote_types(material.coefficients.dtype, e.dtype)
-    e = e[..., : (degree + 1) ** 2].astype(dtype)
-    c = material.coefficients[..., : (degree + 1) ** 2].astype(dtype)
+    degree = min(light.degree, slices.degree)
+    dtype = jnp.promote_types(slices.coefficients.dtype, light.coefficients.dtype)
+    e = light.coefficients[..., : (degree + 1) ** 2].astype(dtype)
+    c = slices.coefficients[..., : (degree + 1) ** 2].astype(dtype)
     c = c.reshape(-1, *c.shape[-2:])
     if like is None:
         try:
@@ -103,47 +120,21 @@ def prefilter(
             raise ValueError(
                 "channels are chosen from values: call prefilter once outside jit and grad, and pass that as `like`."
             ) from error
-        for name, value in zip(("material", "light_coefficients"), values, strict=True):
+        for name, value in zip(("material", "light"), values, strict=True):
             if not np.all(np.isfinite(value)):
                 raise ValueError(f"`{name}` must be finite; got NaN or infinity.")
         like = _choose(*values, tolerance)
-    elif not isinstance(like, PrefilteredLobes) or like.degree != degree:
+    elif not isinstance(like, Prefiltered) or like.degree != degree:
         raise ValueError(f"`like` must come from shading.prefilter at degree {degree}.")
     like = jax.lax.stop_gradient(as_type(like, dtype))
     tables = _filter(c, e.reshape(-1, e.shape[-1]), like, jnp.asarray(_swaps(degree), dtype))
-    return dataclasses.replace(like, **tables, colours=(material.colour, e.shape[:-1]))
-
-
-def shade_prefiltered(
-    prefiltered: PrefilteredLobes, normals: ArrayLike, views: ArrayLike, *, mask: ArrayLike | None = None
-) -> Float[Array, "*batch_colour"]:
-    """Radiance that leaves surface points towards the viewer under the light of `prefilter`.
-
-    Arguments: `normals`, `views` and `mask` as in `shade_environment`. Returns [..., *colour]. A view that is not above
-    the horizon gives 0; a zero or NaN normal or view gives NaN.
-    Derivatives: in normals, views and tables, both modes; twice continuous in directions, where the chart changes up to
-    the error of the splines.
-    Accuracy: that of `prefilter`, and 1e-3 of the highest bands, whatever the degree.
-    Cost: 16 texels of all channels; nothing depends on the degree.
-    """
-    if not isinstance(prefiltered, PrefilteredLobes):
-        raise ValueError(f"`prefiltered` must come from shading.prefilter; got {type(prefiltered).__name__}.")
-    points = {"normals": _checks.vectors("normals", normals), "views": _checks.vectors("views", views)}
-    masked = masks(mask)
-    try:
-        np.broadcast_shapes(*(x.shape for x in (points | masked).values()))
-    except ValueError as error:
-        shapes = " and ".join(f"`{name}` {list(x.shape)}" for name, x in (points | masked).items())
-        raise ValueError(f"{shapes} do not broadcast.") from error
-    dtype = jnp.result_type(prefiltered.maps, *points.values())
-    points = {name: x.astype(dtype) for name, x in points.items()} | masked
-    return by_device(shade_points, points, _shade, as_type(prefiltered, dtype))
+    return dataclasses.replace(like, **tables, colours=(slices.colour, e.shape[:-1]))
 
 
 # ---- choice of channels, on the host
 
 
-def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
+def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> Prefiltered:
     """The centre that needs fewer maps to meet the tolerance, and its channels; no tables yet."""
     degree = _checks.degree_of(c.shape[-1])
     e = e.reshape(-1, e.shape[-1])
@@ -161,7 +152,7 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> PrefilteredLobes:
     pad = lambda x: np.pad(x, ((0, -len(x) % 8), *[(0, 0)] * (x.ndim - 1)))
     table = lambda x: jnp.asarray(pad(x), float)
     highest, none = min(-(-int(m.max()) // 4) * 4, degree), jnp.zeros((0, 0))
-    return PrefilteredLobes(
+    return Prefiltered(
         none, none, jnp.asarray(pad(order), jnp.int32), table(reduce), table(expand),
         jnp.asarray(mirror), jnp.asarray(len(m), jnp.int32), jnp.zeros(()), highest, ((), ()),
     )  # fmt: skip
@@ -246,9 +237,9 @@ def _banded(c: Float[Array, "*batch n"]) -> Float[Array, "*batch l m"]:
 
 @eqx.filter_jit
 def _filter(
-    c: Float[Array, "s v n"], e: Float[Array, "s2 n"], like: PrefilteredLobes, swaps: Float[Array, "l m m"]
+    c: Float[Array, "s v n"], e: Float[Array, "s2 n"], like: Prefiltered, swaps: Float[Array, "l m m"]
 ) -> dict[str, Array]:
-    """`profiles`, `maps` and `error` of `PrefilteredLobes`."""
+    """`profiles`, `maps` and `error` of `Prefiltered`."""
     m = jnp.abs(like.order)
     centred = _centred(c, like.mirror, swaps)
     a = jnp.einsum("al,lasv->sav", like.reduce, centred[:, like.degree + m])
@@ -264,9 +255,7 @@ def _filter(
     }
 
 
-def _error(
-    c: Float[Array, "l m s v"], a: Float[Array, "s a v"], e: Float[Array, "s2 n"], like: PrefilteredLobes
-) -> Scalar:
+def _error(c: Float[Array, "l m s v"], a: Float[Array, "s a v"], e: Float[Array, "s2 n"], like: Prefiltered) -> Scalar:
     """What the channels leave out: RMS over orientations and views relative to the whole, of the worst colour."""
     degree = like.degree
     orders = np.arange(degree + 1, dtype=np.int32)  # V, of order -m, is the same channel
@@ -339,7 +328,7 @@ def _chart(series: Float[Array, "theta phi b"]) -> Float[Array, "texels b"]:
 
 
 @eqx.filter_jit
-def _shade(points: dict[str, Float[Array, "p 3"]], lobes: PrefilteredLobes) -> Float[Array, " p *colour"]:
+def _shade(points: dict[str, Float[Array, "p 3"]], lobes: Prefiltered) -> Float[Array, " p *colour"]:
     material, light = (int(np.prod(c)) for c in lobes.colours)
     rows, first, kept = _grid(lobes.degree)
     width, count = 2 * rows + 4, len(lobes.order)

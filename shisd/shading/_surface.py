@@ -1,254 +1,82 @@
-"""Surface points, as every shading verb takes them: their checks, their frames, and one tile of them after another.
+"""Surface points: where they are, which way they face, and from where they are seen."""
 
-What depends on the number of points is compiled again for every new one. So a batch is filled up to one of few sizes,
-with copies of its last point, before it meets the code that takes long to compile.
-"""
-
-import functools
-import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol, TypeVar, runtime_checkable
-
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._module import Module
 from shisd._typing import Array, ArrayLike, Float
 
-Shape = tuple[int, ...]
 
+class Surface(Module):
+    """Points of surfaces, as a picture or any other batch has them; batch axes broadcast.
 
-@runtime_checkable
-class Surface(Protocol):
-    """What is asked of a material, tabulated or as a matrix."""
-
-    @property
-    def isotropic(self) -> bool: ...
-    @property
-    def colour(self) -> Shape: ...
-
-
-Material = TypeVar("Material", bound=Surface)
-Light = TypeVar("Light")
-Pytree = TypeVar("Pytree")
-_DIRECTIONS = ("normals", "views", "tangents")
-_LANES = 64  # a tile is a multiple of this many points
-_ELSEWHERE = np.array([0.3217, 0.2741, 0.9063])  # a point and a direction, in place of what is masked
-_PARALLEL = 100  # eps, sine of the angle between tangent and normal below which two digits of the frame are not left
-
-
-def surface(
-    name: str,
-    material: Material,
-    tangents: ArrayLike | None,
-    light: Iterable[tuple[str, Shape]],
-    dtypes: Iterable[DTypeLike],
-    mask: ArrayLike | None,
-    **vectors: ArrayLike,
-) -> tuple[Material, dict[str, Array], Shape]:
-    """The material and arrays [..., 3] in the common dtype, and the colour of material and `light` together.
-
-    `name` is that of the material's argument, `tangents` are taken where it needs them, `light` names the colour axes
-    of each light. Where there is a `mask`, it is among the arrays.
+    Arguments: `normals` and `views` [..., 3] in world space, of any length, pointing away from the surface, views
+    towards the eye; `positions` [..., 3] in world space, which local lights need; `tangents` [..., 3], the local x axis
+    of anisotropic materials, of which only the part along the surface counts; `mask` [...], bool: where it is False
+    there is no surface, as in a picture's background, and radiance is 0 with gradient 0, whatever the other arrays hold
+    there. `triangles` [...] and `barycentric` [..., 3]: where each point lies on the mesh of a `models.Visibility`,
+    the index of a triangle and the weights of its corners.
+    Arrays that are not needed may be left out, and are ignored. Wrong shapes are ValueErrors here; a zero normal or
+    view, a tangent along its normal, and NaN give radiance NaN.
     """
-    if not material.isotropic:
-        if tangents is None:
-            raise ValueError("`tangents` [..., 3] are needed: this material is anisotropic.")
-        vectors["tangents"] = tangents
-    arrays = {key: _checks.vectors(key, value) for key, value in vectors.items()}
-    masked = masks(mask)
-    colours = [(name, material.colour), *light]
+
+    normals: Float[Array, "*batch 3"]
+    views: Float[Array, "*batch 3"]
+    positions: Float[Array, "*batch 3"] | None
+    tangents: Float[Array, "*batch 3"] | None
+    mask: Array | None
+    triangles: Array | None
+    barycentric: Float[Array, "*batch 3"] | None
+
+    def __init__(
+        self,
+        normals: ArrayLike,
+        views: ArrayLike,
+        positions: ArrayLike | None = None,
+        tangents: ArrayLike | None = None,
+        *,
+        mask: ArrayLike | None = None,
+        triangles: ArrayLike | None = None,
+        barycentric: ArrayLike | None = None,
+    ):
+        given = {"positions": positions, "tangents": tangents, "barycentric": barycentric}
+        vectors = {"normals": normals, "views": views} | {k: v for k, v in given.items() if v is not None}
+        arrays = {name: _checks.vectors(name, value) for name, value in vectors.items()}
+        self.normals, self.views = arrays["normals"], arrays["views"]
+        self.positions, self.tangents = arrays.get("positions"), arrays.get("tangents")
+        self.barycentric = arrays.get("barycentric")
+        self.mask = None if mask is None else bools(mask)
+        self.triangles = None if triangles is None else _checks.any_array("triangles", triangles)
+        if (triangles is None) != (barycentric is None):
+            raise ValueError("`triangles` [...] and `barycentric` [..., 3] belong together: pass both or none.")
+        shapes = {name: a.shape[:-1] for name, a in arrays.items()}
+        shapes |= {n: a.shape for n, a in (("mask", self.mask), ("triangles", self.triangles)) if a is not None}
+        broadcast_batch(shapes)
+
+    def points(self, *names: str) -> dict[str, Array]:
+        """Arrays [..., k] by name, with the mask [..., 1] where there is one."""
+        masked = {} if self.mask is None else {"mask": self.mask[..., None]}
+        return {name: getattr(self, name) for name in names} | masked
+
+
+def broadcast_batch(shapes: dict[str, tuple[int, ...]]) -> None:
+    """Batch axes by name, which must broadcast."""
     try:
-        np.broadcast_shapes(*(a.shape for a in (arrays | masked).values()))
-        colour = np.broadcast_shapes(*(c for _, c in colours))
+        np.broadcast_shapes(*shapes.values())
     except ValueError as error:
-        shapes = {key: list(a.shape) for key, a in (arrays | masked).items()}
-        named = " and ".join(f"`{key}` {list(c)}" for key, c in colours)
-        raise ValueError(f"batch axes {shapes}, or colours of {named}, do not broadcast.") from error
-    dtype = jnp.result_type(*jax.tree.leaves(material), *dtypes, *arrays.values())
-    return as_type(material, dtype), as_type(arrays, dtype) | masked, colour
+        named = ", ".join(f"`{name}` {list(shape)}" for name, shape in shapes.items())
+        raise ValueError(f"batch axes do not broadcast: {named}.") from error
 
 
-def as_type(tree: Pytree, dtype: DTypeLike) -> Pytree:
-    """The same with all floating arrays in this dtype."""
-    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
-
-
-def masks(mask: ArrayLike | None) -> dict[str, Array]:
-    """The argument `mask` [...] as an array [..., 1] among those of points; none without one."""
-    if mask is None:
-        return {}
+def bools(mask: ArrayLike) -> Array:
+    """The argument `mask` as an array."""
     array = jnp.asarray(mask)
     if array.dtype != bool:
         raise ValueError(f"`mask` must be bool [...], True where there is a surface; got dtype {array.dtype}.")
-    return {"mask": array[..., None]}
+    return array
 
 
-def local_lights(name: str, light: Any, kind: type) -> tuple:
-    """One light of this kind or a sequence of them, as a tuple."""
-    lights = tuple(light) if isinstance(light, Sequence) else (light,)
-    if not lights or not all(isinstance(x, kind) for x in lights):
-        raise ValueError(f"`{name}` must be a models.{kind.__name__} or a sequence of at least one.")
-    return lights
-
-
-def stacked(lights: Iterable[Light]) -> list[Light]:
-    """Lights of one kind and of equal shapes as one, whose arrays have a first axis for them."""
-    kinds: dict[Any, list[Light]] = {}
-    for light in lights:
-        leaves, kind = jax.tree.flatten(light)
-        kinds.setdefault((kind, *(x.shape for x in leaves)), []).append(light)
-    return [jax.tree.map(lambda *x: jnp.stack(x), *group) for group in kinds.values()]
-
-
-def sum_lights(radiance: Callable[[Any], Array], stacks: Iterable[Any], total: Array) -> Array:
-    """`total` and radiance(light) of every light of stacks: the code of one light for each stack, in a loop.
-
-    The backward pass makes each light again, within a tile that it makes again: what it would keep of all lights is
-    never made.
-    """
-    add = jax.checkpoint(lambda x, light: (x + radiance(light), None), prevent_cse=False)
-    for stack in stacks:
-        if len(jax.tree.leaves(stack)[0]) == 1:
-            total += radiance(jax.tree.map(lambda x: x[0], stack))
-        else:
-            total = jax.lax.scan(add, total, stack)[0]
-    return total
-
-
-def shade_points(points: dict[str, Array], shade: Callable[..., Array], *arguments: Any) -> Array:
-    """`shade(points, *arguments)`, which takes flat points [p, k]; instead of p, the result has their batch axes.
-
-    Points where the array "mask" is False are replaced before anything is done with them; there the result is 0.
-    `shade` sees few values of p: powers of two up to 64, then eight to every doubling, at most an eighth too many.
-    """
-    shape = np.broadcast_shapes(*(a.shape[:-1] for a in points.values()))
-    return _shaped(shade(_flat(points, shape), *arguments), points.get("mask"), shape)
-
-
-@functools.partial(jax.jit, static_argnames="shape")
-def _flat(points: dict[str, Array], shape: Shape) -> dict[str, Array]:
-    flat = {name: jnp.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for name, a in points.items()}
-    count = math.prod(shape)
-    mask = flat.pop("mask", None)
-    if mask is not None and count > 0:
-        # a point that is there, so that lights, too, get no gradient but a finite one times zero
-        first = jnp.argmax(mask[:, 0])
-        other = {name: jnp.where(mask[first], a[first], _elsewhere(name, a)) for name, a in flat.items()}
-        flat = {name: jnp.where(mask, a, jax.lax.stop_gradient(other[name])[None]) for name, a in flat.items()}
-    more = _filled(count) - count
-    return {name: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]) for name, a in flat.items()}
-
-
-def _elsewhere(name: str, a: Array) -> Array:
-    """A row of an array of points, for batches in which all is masked."""
-    row = np.roll(_ELSEWHERE, name == "tangents") if a.shape[1] == 3 else np.zeros(a.shape[1])
-    return jnp.asarray(row, a.dtype)
-
-
-def _filled(count: int) -> int:
-    """The size that a batch is filled up to."""
-    octave = 1 << max(count - 1, 0).bit_length()
-    step = octave if octave <= _LANES else octave // 16
-    return -(-count // step) * step
-
-
-@functools.partial(jax.jit, static_argnames="shape")
-def _shaped(values: Array, mask: Array | None, shape: Shape) -> Array:
-    colour = values.shape[1:]
-    values = values[: math.prod(shape)].reshape(*shape, *colour)
-    if mask is None:
-        return values
-    return jnp.where(jnp.broadcast_to(mask[..., 0], shape).reshape(*shape, *(1,) * len(colour)), values, 0)
-
-
-def shade_tiles(
-    material: Surface,
-    points: dict[str, Array],
-    colour: Shape,
-    size: int,
-    radiance: Callable[..., Float[Array, "*colour p"]],
-    light: Any,
-) -> Float[Array, " p *colour"]:
-    """`radiance(frame, local, **others)` of all points, `size` at a time; 0 where no view is above the horizon.
-
-    `frame` [p, 3, 3] is local to world, `local` [p, 3] is the view in it, and `others` are the `points` of the tile
-    that are not directions. A point, material or `light` that is not finite gives NaN.
-    """
-    shared = finite_mark(material, light)
-
-    def shade_tile(tile: dict[str, Array]) -> Float[Array, " p *colour"]:
-        directions = {name: normalize(a) for name, a in tile.items() if name in _DIRECTIONS}
-        others = {name: a for name, a in tile.items() if name not in _DIRECTIONS}
-        normal = directions["normals"]
-        r = frame(normal) if material.isotropic else tangent_frame(normal, directions["tangents"])
-        local = jnp.einsum("pij,pi->pj", r, directions["views"])
-        values = radiance(r, local, **others)
-        seen = (local[:, 2] > 0).reshape(-1, *(1,) * len(colour))
-        return finite_or_nan(jnp.where(seen, jnp.moveaxis(values, -1, 0), 0), [r, local, *others.values()], shared)
-
-    return in_tiles(shade_tile, points, size)
-
-
-def in_tiles(function: Callable[[dict[str, Array]], Array], rows: dict[str, Array], size: int) -> Array:
-    """function(rows) for at most `size` rows at a time, all tiles alike; the backward pass makes each tile again."""
-    count = len(next(iter(rows.values())))
-    if count == 0:
-        first = {name: jax.ShapeDtypeStruct((1, *a.shape[1:]), a.dtype) for name, a in rows.items()}
-        one = jax.eval_shape(function, first)
-        return jnp.zeros((0, *one.shape[1:]), one.dtype)
-    tiles = -(-count // size)
-    size = min(count, size, -(-count // (tiles * _LANES)) * _LANES)  # of equal size, for little to fill up
-    more = tiles * size - count
-    fill = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]).reshape(tiles, size, -1)
-    values = jax.lax.map(jax.checkpoint(function), {name: fill(a) for name, a in rows.items()})
-    return values.reshape(tiles * size, *values.shape[2:])[:count]
-
-
-def finite_mark(*arrays: Any) -> Array:
-    """A sum of all floating numbers in these pytrees that is finite where all are, of next to no size."""
-    floating = [x for x in jax.tree.leaves(arrays) if jnp.issubdtype(x.dtype, jnp.floating)]
-    return functools.reduce(jnp.add, [jnp.sum(x * jnp.finfo(x.dtype).tiny) for x in floating])
-
-
-def finite_or_nan(values: Float[Array, "p ..."], own: Iterable[Array], shared: Array) -> Float[Array, "p ..."]:
-    """`values`, but NaN, with NaN derivatives, where a point's `own` arrays [p, ...] or what all share is not finite.
-
-    `shared` is a `finite_mark`. Comparisons, on which choices depend, take NaN for "no": without this NaN becomes dark.
-    """
-    mark = jax.vmap(lambda own: finite_mark(own))(list(own)) + shared
-    none = jnp.where(jnp.isfinite(mark), 0, jnp.nan) * mark
-    return values + none.reshape(-1, *(1,) * (values.ndim - 1))
-
-
-@jax.custom_jvp
-def frame(normal: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
-    """R with R z = n and R^T z = (sin, 0, cos), for isotropic materials, which do not mind a turn about n.
-
-    No choice of such frames is smooth everywhere. But what they are used for does not depend on the choice, so its
-    derivative may follow any: the frame that turns no more than the normal does, about n x dn.
-    """
-    x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
-    rho = jnp.sqrt(x * x + y * y)
-    safe = jnp.where(rho > 0, rho, 1)
-    cos, sin, zero = jnp.where(rho > 0, x / safe, 1), y / safe, jnp.zeros_like(x)
-    rows = [[-cos * z, sin, x], [-sin * z, -cos, y], [rho, zero, z]]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-@frame.defjvp
-def _frame_jvp(primals, tangents):
-    (normal,), (dn,) = primals, tangents
-    r = frame(normal)
-    return r, jnp.cross(jnp.cross(normal, dn)[:, :, None], r, axis=1)
-
-
-def tangent_frame(normal: Float[Array, "p 3"], tangent: Float[Array, "p 3"]) -> Float[Array, "p 3 3"]:
-    """R = (t, b, n), t along the part of the unit tangent that is orthogonal to n; NaN where only rounding is left."""
-    t = tangent - jnp.sum(normal * tangent, axis=-1, keepdims=True) * normal
-    parallel = jnp.sum(t * t, axis=-1, keepdims=True) <= (_PARALLEL * jnp.finfo(t.dtype).eps) ** 2
-    t = normalize(jnp.where(parallel, jnp.nan, 1) * t)
-    return jnp.stack([t, jnp.cross(normal, t), normal], axis=-1)
+def check_surface(surface: object) -> None:
+    if not isinstance(surface, Surface):
+        raise ValueError(f"`surface` must be a shading.Surface of normals and views; got {type(surface).__name__}.")

@@ -14,6 +14,7 @@ from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics.internal import bands, orders, rows
 from shisd.shading import _views
+from shisd.shading.slices._upper import RIDGE, fit_above
 
 
 class Slices(Module):
@@ -67,6 +68,25 @@ class Slices(Module):
         view = _checks.vectors("view", view).astype(table.dtype)
         return slice_values(table, view[None], self)[..., 0]
 
+    def cut(self, degree: int) -> "Slices":
+        """The same up to a lower `degree`."""
+        degree = _checks.degree(degree)
+        if degree > self.degree:
+            raise ValueError(f"`degree` must be at most that of the slices, {self.degree}; got {degree}.")
+        if self.domain != "sphere":
+            raise ValueError("slices fitted above the horizon are not cut: cut those on the sphere, then fit.")
+        return self._with(self.coefficients[..., : (degree + 1) ** 2], "sphere")
+
+    def above_horizon(self, *, ridge: float = RIDGE) -> "Slices":
+        """Of the same degree, fitted above the horizon only, for light that is cut off there (`tabulate_brdf`)."""
+        if self.domain != "sphere":
+            raise ValueError("these slices are fitted above the horizon already.")
+        ridge = _checks.number("ridge", ridge, positive=True)
+        return self._with(fit_above(self.coefficients, ridge), "upper")
+
+    def _with(self, coefficients: Array, domain: Literal["sphere", "upper"]) -> "Slices":
+        return Slices(coefficients, quadrature_error=self.quadrature_error, isotropic=self.isotropic, domain=domain)
+
     @method
     def weights(self, basis: RotatedZonalBasis) -> Float[Array, "*colour_views l k"]:
         """RZH weights of the slices, of least norm (ISD15 Eq. 21), on a `basis` of their degree.
@@ -95,14 +115,6 @@ class Slices(Module):
             raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis; got {type(basis).__name__}.")
         c = basis.coefficients(weights)
         return cls(c, quadrature_error=quadrature_error, isotropic=isotropic, domain=domain)
-
-
-def check_slices(material: object, *, everywhere: bool) -> None:
-    """Slices that stand for the material `everywhere`, or above the horizon at least."""
-    if not isinstance(material, Slices):
-        raise ValueError(f"`material` must come from shading.tabulate_brdf; got {type(material).__name__}.")
-    if everywhere and material.domain != "sphere":
-        raise ValueError("`material` was fitted above the horizon only; tabulate it with domain='sphere'.")
 
 
 def check_domain(domain: object) -> None:

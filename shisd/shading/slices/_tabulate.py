@@ -27,16 +27,17 @@ from shisd.harmonics.internal import orders, weighted_sums
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 from shisd.shading.slices._slices import Slices, check_domain
-from shisd.shading.slices._upper import RIDGE, fit_above, hemisphere_modes, unit_gauss
+from shisd.shading.slices._upper import RIDGE, hemisphere_modes, unit_gauss
 
 Pytree = TypeVar("Pytree")
+Norms = tuple[float | None, ...]  # in which errors are judged: on the sphere (None), or of fits above the horizon
 
 
 def tabulate_brdf(
     brdf: AbstractBrdf,
     degree: int | RotatedZonalBasis,
     *,
-    views: int = 64,
+    elevations: int = 64,
     azimuths: int | None = None,
     quadrature: int | None = None,
     domain: Literal["sphere", "upper"] = "sphere",
@@ -47,7 +48,7 @@ def tabulate_brdf(
 ) -> Slices:
     """A material's cosine-weighted view slices, projected on spherical harmonics (ISD15 Eq. 21).
 
-    Arguments: `brdf`. Static: `degree`, or a basis of that degree; `views`, elevations of the table, at least 4;
+    Arguments: `brdf`. Static: `degree`, or a basis of that degree; `elevations` of the table's views, at least 4;
     `azimuths`, even, for anisotropic materials only, by default 2 degree + 4 and at least 32: a slice turns with the
     view, so its order m goes round m times, and fewer azimuths alias without notice; `quadrature`, nodes from the
     mirror direction to the horizon (and half as many in each eighth of a turn about it).
@@ -68,21 +69,39 @@ def tabulate_brdf(
     format at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in
     float32, 2e-7 for GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1;
     4e-4 or less for tables in MERL's format at degree 16.
-    Cost: 1.8 views x quadrature^2 evaluations of the material; one view's harmonics are in memory at a time.
+    Cost: 1.8 elevations x quadrature^2 evaluations of the material; one view's harmonics are in memory at a time.
     """
+    degree = degree.degree if isinstance(degree, RotatedZonalBasis) else _checks.degree(degree)
+    check_domain(domain)
+    ridge = _checks.number("ridge", ridge, positive=True)
+    norms = (ridge,) if domain == "upper" else (None,)
+    slices = table(brdf, degree, norms, elevations, azimuths, quadrature, tolerance, throw, progress)
+    return slices.above_horizon(ridge=ridge) if domain == "upper" else slices
+
+
+def table(
+    brdf: AbstractBrdf,
+    degree: int,
+    norms: Norms,
+    elevations: int,
+    azimuths: int,
+    quadrature: int | None,
+    tolerance: float,
+    throw: bool,
+    progress: Progress,
+) -> Slices:
+    """Slices on the sphere by the first rule whose error is within the tolerance in all `norms`."""
     if not isinstance(brdf, AbstractBrdf):
         raise ValueError(f"`brdf` must be a models.AbstractBrdf; got {type(brdf).__name__}.")
-    degree = degree.degree if isinstance(degree, RotatedZonalBasis) else _checks.degree(degree)
-    views = _checks.integer("views", views, 4)
+    elevations = _checks.integer("elevations", elevations, 4)
     azimuths = max(32, 2 * degree + 4) if azimuths is None else _checks.integer("azimuths", azimuths, 4)
     if azimuths % 2:
         raise ValueError(f"`azimuths` must be even; got {azimuths}.")
-    check_domain(domain)
-    ridge, tolerance = (_checks.number(n, v, positive=True) for n, v in (("ridge", ridge), ("tolerance", tolerance)))
-    dtype, fit = jnp.result_type(brdf.lobe_width), ridge if domain == "upper" else None
-    slices = lambda nodes: slices_at(_views.elevations(views), brdf, degree, dtype, azimuths, nodes, fit, progress)
-    c, error = by_convergence(slices, 32 + degree, quadrature, tolerance, throw)
-    return Slices(c, quadrature_error=error, isotropic=brdf.isotropic, domain=domain)
+    tolerance = _checks.number("tolerance", tolerance, positive=True)
+    theta, dtype = _views.elevations(elevations), jnp.result_type(brdf.lobe_width)
+    made = lambda nodes: slices_at(theta, brdf, degree, dtype, azimuths, nodes, norms, progress)
+    c, error = by_convergence(made, 32 + degree, quadrature, tolerance, throw)
+    return Slices(c, quadrature_error=error, isotropic=brdf.isotropic)
 
 
 def by_convergence(
@@ -133,16 +152,16 @@ def slices_at(
     dtype: DTypeLike,
     azimuths: int,
     quadrature: int,
-    ridge: float | None,
+    norms: Norms,
     progress: Progress = None,
 ) -> tuple[Float[Array, "*colour_views n"], Scalar]:
-    """SH coefficients of the slices at elevations `theta` of the view, and the quadrature's error."""
+    """SH coefficients of the slices at elevations `theta` of the view, and the quadrature's error in the worst norm."""
     phi = np.zeros(1) if brdf.isotropic else 2 * np.pi * np.arange(azimuths) / azimuths
     grid = np.meshgrid(theta, phi, indexing="ij")
     sine, cosine = np.sin(grid[0]), np.cos(grid[0])
     local = np.stack([sine * np.cos(grid[1]), sine * np.sin(grid[1]), cosine], axis=-1).astype(dtype)  # [V, A, 3]
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(brdf))
-    project = lambda views: _project(brdf, views, degree, quadrature, ridge)
+    project = lambda views: _project(brdf, views, degree, quadrature, norms)
     if progress is None or traced:
         c, changes = project(local.reshape(-1, 3))
     else:
@@ -153,13 +172,13 @@ def slices_at(
                 step()
         c, changes = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     shares = np.sin(2 * theta) * np.abs(np.gradient(theta))  # of a sphere's picture
-    return _as_table(c, changes, jnp.asarray(shares, dtype), brdf.isotropic, ridge)
+    return _as_table(c, changes, jnp.asarray(shares, dtype), brdf.isotropic)
 
 
 @eqx.filter_jit
 def _project(
-    brdf: AbstractBrdf, views: ArrayLike, degree: int, quadrature: int, ridge: float | None
-) -> tuple[Float[Array, " v *colour_n"], Float[Array, "v 3 *colour"]]:
+    brdf: AbstractBrdf, views: ArrayLike, degree: int, quadrature: int, norms: Norms
+) -> tuple[Float[Array, " v *colour_n"], Float[Array, "v 3 norms *colour"]]:
     """Slices for every view [v, 3], and squared norms of what two steps of the rule change, and of the slices."""
     views = jnp.asarray(views)
     width = jnp.asarray(jax.lax.stop_gradient(brdf.lobe_width), views.dtype)
@@ -170,23 +189,26 @@ def _project(
         fine = project_slice(brdf, view, width, degree, quadrature)
         less, least = (project_slice(fixed, view, width, degree, q) for q in (3 * quadrature // 4, quadrature // 2))
         still = jax.lax.stop_gradient(fine)
-        seen = [less - least, still - less, still]
-        if ridge is not None:
-            modes, shares = hemisphere_modes(degree)  # the norm of fits above the horizon
-            scale = jnp.asarray(modes * (np.sqrt(shares) / (shares + ridge))[None], view.dtype)
-            seen = [x @ scale for x in seen]
-        return fine, jnp.stack([jnp.sum(x * x, axis=-1) for x in seen])
+        seen = jnp.stack([less - least, still - less, still])
+        return fine, jnp.stack([jnp.sum(jnp.square(_scaled(seen, ridge)), axis=-1) for ridge in norms], axis=1)
 
     return jax.lax.map(project, views)
+
+
+def _scaled(c: Float[Array, "*batch n"], ridge: float | None) -> Float[Array, "*batch n"]:
+    """Numbers whose squares sum to that of the norm on the sphere, or of the fit above the horizon."""
+    if ridge is None:
+        return c
+    modes, shares = hemisphere_modes(_checks.degree_of(c.shape[-1]))
+    return c @ jnp.asarray(modes * (np.sqrt(shares) / (shares + ridge))[None], c.dtype)
 
 
 @eqx.filter_jit
 def _as_table(
     c: Float[Array, " v *colour_n"],
-    changes: Float[Array, "v 3 *colour"],
+    changes: Float[Array, "v 3 norms *colour"],
     shares: Float[Array, " elevations"],
     isotropic: bool,
-    ridge: float | None,
 ) -> tuple[Float[Array, "*colour_views n"], Scalar]:
     views = (len(shares),) if isotropic else (len(shares), len(c) // len(shares))
     before, after, whole = jnp.tensordot(shares, changes.reshape(len(shares), -1, *changes.shape[1:]).sum(axis=1), 1)
@@ -194,7 +216,7 @@ def _as_table(
     square = after / jnp.where(whole > 0, whole, 1) * ratio(after, before)
     error = jnp.maximum(2 * safe_sqrt(jnp.max(square)), 8 * float(jnp.finfo(c.dtype).eps))  # at least the rounding
     c = jnp.moveaxis(c.reshape(*views, *c.shape[1:]), range(len(views)), range(-1 - len(views), -1))  # colour first
-    return (c if ridge is None else fit_above(c, ridge)), error
+    return c, error
 
 
 def project_slice(

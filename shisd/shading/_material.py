@@ -1,0 +1,107 @@
+"""Materials made ready: a form of their slices for light from all around, and one for light above the horizon."""
+
+from typing import Literal
+
+from shisd import _checks
+from shisd._module import Module
+from shisd._progress import Progress
+from shisd.models import AbstractBrdf
+from shisd.shading._matrix import BrdfMatrix
+from shisd.shading.slices._slices import Slices
+from shisd.shading.slices._tabulate import table
+from shisd.shading.slices._upper import RIDGE
+
+
+class Material(Module):
+    """A material as `shade` takes it.
+
+    `distant`: slices that stand for it everywhere, or its matrix, for light from all around; `local`: slices for light
+    that is cut off at the horizon, best fitted above it. `None` where there is no such light.
+    """
+
+    distant: Slices | BrdfMatrix | None
+    local: Slices | None
+
+    def __init__(self, distant: Slices | BrdfMatrix | None = None, local: Slices | None = None):
+        if distant is None and local is None:
+            raise ValueError("a material needs `distant` or `local` slices; got neither.")
+        if not isinstance(distant, Slices | BrdfMatrix | None):
+            raise ValueError(f"`distant` must be shading.Slices or BrdfMatrix; got {type(distant).__name__}.")
+        if distant is not None and distant.domain != "sphere":
+            raise ValueError("`distant` was fitted above the horizon only; make it with domain='sphere'.")
+        if not isinstance(local, Slices | None):
+            raise ValueError(f"`local` must be shading.Slices; got {type(local).__name__}.")
+        self.distant, self.local = distant, local
+
+
+def prepare(
+    brdf: AbstractBrdf,
+    degree: int,
+    *,
+    local_degree: int | None = None,
+    elevations: int = 64,
+    azimuths: int | None = None,
+    quadrature: int | None = None,
+    tolerance: float = 1e-3,
+    throw: bool = True,
+    progress: Progress = None,
+) -> Material:
+    """A material made ready for every kind of light: slices by view for distant light, and fitted for local light.
+
+    Arguments: `brdf`; static `degree` for distant light and balls, `local_degree` for polygons and portals, by default
+    the same; the others as in `tabulate_brdf`, which integrates the material once, to the higher degree.
+    Derivatives: in every parameter of the material, both modes. The result has the dtype of these.
+    Accuracy and cost: `tabulate_brdf`.
+    """
+    degree = _checks.degree(degree)
+    local_degree = degree if local_degree is None else _checks.integer("local_degree", local_degree)
+    most = max(degree, local_degree)
+    slices = table(brdf, most, (None, RIDGE), elevations, azimuths, quadrature, tolerance, throw, progress)
+    return Material(slices.cut(degree), slices.cut(local_degree).above_horizon())
+
+
+def as_material(material: object) -> Material:
+    """Slices and matrices as the materials that they stand for."""
+    match material:
+        case Material():
+            return material
+        case Slices(domain="sphere"):
+            return Material(material, material)
+        case Slices():
+            return Material(None, material)
+        case BrdfMatrix():
+            return Material(material)
+    hint = " Make it ready by shading.prepare." if isinstance(material, AbstractBrdf) else ""
+    raise ValueError(
+        f"`material` must come from shading.prepare, tabulate_brdf or project_brdf; got {type(material).__name__}.{hint}"
+    )
+
+
+Everywhere = Literal["DistantLight", "ZonalLight", "Occluded", "SphereLight"]
+
+
+def slices_everywhere(material: Material, light: Everywhere) -> Slices:
+    """The slices for a light from all around that takes no matrix."""
+    form = distant_form(material, light)
+    if isinstance(form, BrdfMatrix):
+        raise ValueError(
+            f"`material` is a BrdfMatrix, which goes with DistantLight only; for a {light} pass its `slices()`."
+        )
+    return form
+
+
+def distant_form(material: Material, light: Everywhere) -> Slices | BrdfMatrix:
+    if material.distant is None:
+        raise ValueError(
+            f"`material` was fitted above the horizon only, and a {light} shines on it from all around: pass "
+            "shading.prepare(brdf, degree), or slices with domain='sphere'."
+        )
+    return material.distant
+
+
+def local_form(material: Material, light: Literal["PolygonLight", "PortalLight"]) -> Slices:
+    if material.local is None:
+        raise ValueError(
+            f"`material` has no slices for a {light}: pass shading.prepare(brdf, degree), or the `slices()` of a matrix."
+        )
+    return material.local

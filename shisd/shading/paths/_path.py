@@ -1,0 +1,22 @@
+"""What `shade` has to know of a path."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from shisd._typing import Array
+from shisd.shading._material import Material
+from shisd.shading._surface import Surface
+from shisd.shading._tiles import Form
+
+
+class Path(NamedTuple):
+    """One way from a material and lights of its kinds to radiance.
+
+    `form(material, light)`: what it takes of the material, or ValueError, for a light of this name; `radiance(form,
+    lights, points, surface)`: [..., *colour] of their colours, all in one dtype, `points` the arrays [..., k] of the
+    surface that it uses; static `local`: positions are among them.
+    """
+
+    form: Callable[[Material, str], Form]
+    radiance: Callable[[Any, list, dict[str, Array], Surface], Array]
+    local: bool

@@ -1,0 +1,151 @@
+"""Radiance from polygon lights and portals: CSH18 Eq. 12 to 14, in the local frame of every point.
+
+The light's outline, relative to the point, is cut off at the horizon and projected on the sphere; the material's slice
+is integrated over it exactly. With the slice as weights on zonal functions about shared axes this is one fused sum over
+their moments (`domains.moments.fold`), and nothing per pixel is a matrix.
+
+Where radiance depends on direction, the integrand is a product. Its matrix M, from the coefficients of a slice to those
+of slice times light, is the same for all points; with b = integrals of the basis over the outline, the radiance is
+b . M c, and M^T b are the coefficients of the light that comes through the outline. They are made in world space, and
+only they are turned to the local frame.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shisd import _checks
+from shisd._numerics import dot, times
+from shisd._sharding import by_device
+from shisd._typing import Array, Float
+from shisd.domains.internal import (
+    Loop,
+    clip,
+    fold_expansion,
+    loop_coefficients,
+    loop_solid_angle,
+    on_sphere,
+    zonal_inverse,
+)
+from shisd.harmonics.internal import product_matrices, rotate_many
+from shisd.models import PolygonLight, PortalLight
+from shisd.models.internal import facing
+from shisd.shading._incidence import incidence_integrals
+from shisd.shading._material import local_form
+from shisd.shading._surface import Surface
+from shisd.shading._tiles import shade_points, shade_tiles, stacked, sum_lights
+from shisd.shading.paths._path import Path
+from shisd.shading.slices._slices import Slices, lookup_factors, lookup_table, slice_values
+
+Light = PolygonLight | PortalLight
+_TILE = 2048  # pixels at a time
+SMALL_TILE = 128  # where every pixel holds the moments about all axes
+Y_00 = math.sqrt(1 / (4 * math.pi))
+
+
+def radiance(
+    slices: Slices, lights: list[Light], points: dict[str, Array], _: Surface
+) -> Float[Array, "*batch_colour"]:
+    colour = np.broadcast_shapes(slices.colour, *(light.colour for light in lights))
+    return by_device(shade_points, points, _shade, slices, lights, colour)
+
+
+PATH = Path(local_form, radiance, local=True)
+
+
+@eqx.filter_jit
+def _shade(
+    points: dict[str, Float[Array, "p 3"]], slices: Slices, lights: list[Light], colour: tuple[int, ...]
+) -> Float[Array, " p *colour"]:
+    table = lookup_table(slices)
+    kinds = stacked(lights)
+    stacks = [(stack, _products(stack, slices.degree)) for stack in kinds]
+
+    def of_tile(
+        frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
+    ) -> Float[Array, "*colour p"]:
+        zero = jnp.zeros((*colour, positions.shape[0]), table.dtype)
+
+        def of_light(one: tuple[Light, Array | None]) -> Float[Array, "*colour p"]:
+            light, product = one
+            relative = light.points.T[:, :, None] - positions.T[:, None]
+            above = dot(frame[:, :, 2].T[:, None], relative)
+            sign = jnp.where(jnp.max(above, axis=0) > 0, facing(light, relative), 0)
+            outline = _in_frame(frame, relative)
+            if product is None:
+                lit = times(_uniform(slices, table, local, outline, above, sign), light.incident() * Y_00)
+            else:
+                lit = _directional(slices, table, frame, local, outline, product)
+            return jnp.broadcast_to(times(lit, sign), zero.shape)
+
+        return sum_lights(of_light, stacks, zero)
+
+    size = _TILE if all(product is None for _, product in stacks) else SMALL_TILE
+    return shade_tiles(slices, points, colour, size, of_tile, kinds)
+
+
+def _uniform(slices: Slices, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:
+    """Integrals of slices over the outline above the horizon, [*colour, p]."""
+    dark = sign == 0
+    spare = outline.shape[1] // 2  # edges, unless the horizon cuts an outline of this tile
+
+    def integrals() -> Float[Array, "*colour p"]:
+        whole = lambda: jnp.concatenate([outline, *[outline[:, :1]] * spare], axis=1)
+        all_whole = jnp.all((jnp.min(above, axis=0) > 0) | dark)
+        v = on_sphere(jax.lax.cond(all_whole, whole, lambda: clip(outline, above)))
+        angle = loop_solid_angle(v, 2 * np.pi, _up(v))
+        if slices.isotropic:
+            constant, of_colours = table[..., 0, :] @ lookup_factors(local, slices), table
+            of_one = lambda t: incidence_integrals(t, local, v, slices.degree, spare)
+        else:
+            of_colours = slice_values(table, local, slices)
+            constant, inverse = of_colours[..., 0, :], zonal_inverse(slices.degree, table.dtype)
+            of_one = lambda c: fold_expansion(c, v, *inverse, spare)
+        # colours in a loop: compiled code would grow with their number
+        rest = jax.lax.map(of_one, of_colours) if slices.colour else of_one(of_colours)
+        return times(constant, angle * Y_00) + rest
+
+    nothing = lambda: jnp.zeros((*slices.colour, len(local)), table.dtype)
+    return jax.lax.cond(jnp.all(dark), nothing, integrals)
+
+
+def _directional(
+    slices: Slices, table: Array, frame: Array, local: Array, outline: Loop, product: Float[Array, "*colour_n_m"]
+) -> Float[Array, "*colour p"]:
+    """Integrals of slices times the light's radiance, over its outline above the horizon."""
+    c, v = slice_values(table, local, slices), on_sphere(clip(outline, outline[2]))
+    to_local = jnp.swapaxes(frame, 1, 2)
+    world = _in_frame(to_local, v)
+    seen = through(product, world, loop_solid_angle(v, 2 * np.pi, _up(v))).reshape(-1, c.shape[-2], v.shape[2])
+    seen = rotate_many(jnp.moveaxis(seen, 0, 1), to_local, slices.degree, slices.isotropic)
+    seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *c.shape[-2:])
+    return jnp.sum(times(c, seen), axis=-2)
+
+
+def _up(v: Loop) -> Float[Array, "3 p"]:
+    return jnp.broadcast_to(jnp.asarray([0, 0, 1], v.dtype)[:, None], (3, v.shape[2]))
+
+
+def _in_frame(frame: Float[Array, "p 3 3"], v: Loop) -> Loop:
+    """frame^T v, written out: XLA has no fast code for many small products."""
+    return jnp.stack([dot(axis[:, None], v) for axis in jnp.moveaxis(frame, 0, -1).swapaxes(0, 1)])
+
+
+def _products(stack: Light, degree: int) -> Float[Array, " lights *colour_n_m"] | None:
+    return jax.lax.map(lambda light: product_of(light, degree), stack)
+
+
+def product_of(light: Light, degree: int) -> Float[Array, "*colour_n_m"] | None:
+    """From coefficients of a slice to those of slice times light; None where light is constant."""
+    incident = light.incident()
+    light_degree = _checks.degree_of(incident.shape[-1])
+    return None if light_degree == 0 else product_matrices(incident, light_degree + degree, degree)
+
+
+def through(product: Float[Array, "*colour_n_m"], v: Loop, solid_angle: Array) -> Float[Array, "*c n p"]:
+    """Coefficients of a light cut off outside loops."""
+    b = loop_coefficients(v, solid_angle, _checks.degree_of(product.shape[-2]))
+    return jnp.einsum("...tn,tp->...np", product, b)
