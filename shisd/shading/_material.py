@@ -72,9 +72,8 @@ def as_material(material: object) -> Material:
         case BrdfMatrix():
             return Material(material)
     hint = " Make it ready by shading.prepare." if isinstance(material, AbstractBrdf) else ""
-    raise ValueError(
-        f"`material` must come from shading.prepare, tabulate_brdf or project_brdf; got {type(material).__name__}.{hint}"
-    )
+    came = type(material).__name__
+    raise ValueError(f"`material` must come from shading.prepare, tabulate_brdf or project_brdf; got {came}.{hint}")
 
 
 Everywhere = Literal["DistantLight", "ZonalLight", "Occluded", "SphereLight"]
@@ -102,6 +101,6 @@ def distant_form(material: Material, light: Everywhere) -> Slices | BrdfMatrix:
 def local_form(material: Material, light: Literal["PolygonLight", "PortalLight"]) -> Slices:
     if material.local is None:
         raise ValueError(
-            f"`material` has no slices for a {light}: pass shading.prepare(brdf, degree), or the `slices()` of a matrix."
+            f"`material` has no slices for a {light}: pass shading.prepare(brdf, degree), or `slices()` of a matrix."
         )
     return material.local

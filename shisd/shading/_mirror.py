@@ -37,7 +37,7 @@ from shisd.harmonics.internal import (
 from shisd.models import DistantLight
 from shisd.shading._footprint import Footprint
 from shisd.shading._frames import frame
-from shisd.shading._surface import bools
+from shisd.shading._surface import masks
 from shisd.shading._tiles import as_type, finite_mark, finite_or_nan, in_tiles, shade_points
 
 _NUMBERS_AT_ONCE = 1 << 18  # coefficients of footprints in a tile
@@ -127,7 +127,7 @@ def _points(footprint: object, mask: ArrayLike | None) -> tuple[dict[str, Array]
         raise ValueError(f"`footprint.axes` must have shape {[*d.shape, 2]}; got {list(axes.shape)}.")
     points, masked = (
         {"directions": d, "along_columns": axes[..., 0], "along_rows": axes[..., 1]},
-        {} if mask is None else {"mask": bools(mask)[..., None]},
+        masks(mask),
     )
     try:
         np.broadcast_shapes(*(a.shape for a in (points | masked).values()))

@@ -11,7 +11,7 @@ from shisd._typing import Array, ArrayLike, Float
 from shisd.domains import HaarBasis
 from shisd.domains.internal import clip_to_cells, loop_coefficients, loop_solid_angle, on_sphere
 from shisd.models.internal import facing, towards
-from shisd.shading._surface import bools
+from shisd.shading._surface import masks
 from shisd.shading._tiles import as_type, finite_mark, finite_or_nan, in_tiles, shade_points
 from shisd.shading.paths._polygon import SMALL_TILE, Y_00, Light, product_of, through
 
@@ -35,9 +35,8 @@ def project_light(
         basis = _checks.integer("basis", basis)
     p = _checks.vectors("positions", positions)
     dtype = jnp.promote_types(p.dtype, light.points.dtype)
-    masked = {} if mask is None else {"mask": bools(mask)[..., None]}
     light = as_type(light, dtype)
-    return by_device(shade_points, {"positions": p.astype(dtype)} | masked, _project, light, basis)
+    return by_device(shade_points, {"positions": p.astype(dtype)} | masks(mask), _project, light, basis)
 
 
 @eqx.filter_jit

@@ -12,7 +12,7 @@ from shisd.models import DistantLight, Environment, Occluded, PolygonLight, Port
 from shisd.shading._material import Material, as_material
 from shisd.shading._matrix import BrdfMatrix
 from shisd.shading._surface import Surface, check_surface
-from shisd.shading._tiles import as_type
+from shisd.shading._tiles import as_type, floating_type
 from shisd.shading.paths import _distant, _occluded, _polygon, _sphere, _zonal
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices
@@ -64,9 +64,9 @@ def shade(
     anything. Memory: one tile of at most 4096 points, and the result, also for gradients. Batches that are sharded over
     devices stay there, and nothing is sent.
     Derivatives: in every floating field of material, lights and surface, both modes, any order, also where a normal
-    lies along an axis of the world; where a view or a ball lies along the normal, the first; of polygons the first. The cut
-    at the horizon is a discontinuity of the view, with no gradient. At the surface of a ball those in its position and
-    radius go to infinity.
+    lies along an axis of the world; where a view or a ball lies along the normal, the first; of polygons the first. The
+    cut at the horizon is a discontinuity of the view, with no gradient. At the surface of a ball those in its position
+    and radius go to infinity.
     """
     check_surface(surface)
     ready, known = as_material(material), _known(lights)
@@ -81,7 +81,7 @@ def shade(
     except ValueError as error:
         named = " and ".join(f"`{name}` {list(c)}" for name, c in colours.items())
         raise ValueError(f"colours of {named} do not broadcast.") from error
-    dtype = jnp.result_type(
+    dtype = floating_type((forms, known, points))
         *(x for x in jax.tree.leaves((forms, known, points)) if jnp.issubdtype(x.dtype, jnp.floating))
     )
     parts = []

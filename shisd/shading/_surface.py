@@ -56,8 +56,7 @@ class Surface(Module):
 
     def points(self, *names: str) -> dict[str, Array]:
         """Arrays [..., k] by name, with the mask [..., 1] where there is one."""
-        masked = {} if self.mask is None else {"mask": self.mask[..., None]}
-        return {name: getattr(self, name) for name in names} | masked
+        return {name: getattr(self, name) for name in names} | masks(self.mask)
 
 
 def broadcast_batch(shapes: dict[str, tuple[int, ...]]) -> None:
@@ -67,6 +66,11 @@ def broadcast_batch(shapes: dict[str, tuple[int, ...]]) -> None:
     except ValueError as error:
         named = ", ".join(f"`{name}` {list(shape)}" for name, shape in shapes.items())
         raise ValueError(f"batch axes do not broadcast: {named}.") from error
+
+
+def masks(mask: ArrayLike | None) -> dict[str, Array]:
+    """The argument `mask` [...] as an array [..., 1] among those of points; none without one."""
+    return {} if mask is None else {"mask": bools(mask)[..., None]}
 
 
 def bools(mask: ArrayLike) -> Array:

@@ -40,6 +40,12 @@ def as_type(tree: Pytree, dtype: DTypeLike) -> Pytree:
     return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
+def floating_type(tree: Any) -> jnp.dtype:
+    """The dtype that all floating arrays of a pytree promote to."""
+    dtypes = (x.dtype for x in jax.tree.leaves(tree))
+    return jnp.result_type(*(dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)))
+
+
 def stacked(lights: Iterable[Light]) -> list[Light]:
     """Lights of one kind and of equal shapes as one, whose arrays have a first axis for them."""
     kinds: dict[Any, list[Light]] = {}
