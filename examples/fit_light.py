@@ -48,15 +48,15 @@ def chain(picture: _fit.Picture) -> Callable:
     sky_slices = shading.tabulate_brdf(material, LIGHT_DEGREE)
     lamp_slices = shading.tabulate_brdf(material, DEGREE, domain="upper")
     harmonics = jnp.eye((LIGHT_DEGREE + 1) ** 2, dtype=points.dtype)
-    sky = shading.shade_environment(sky_slices, harmonics, points, views)
+    sky = shading.shade(sky_slices, models.DistantLight(harmonics), shading.Surface(points, views))
 
     portal = models.PortalLight(known["outline"], harmonics)
 
     def images(place: jax.Array) -> jax.Array:
         corners = known["outline"] + place
-        lamp = shading.shade_polygon(lamp_slices, models.PolygonLight(corners), points, points, views)
+        lamp = shading.shade(lamp_slices, models.PolygonLight(corners), shading.Surface(points, views, points))
         moved = eqx.tree_at(lambda p: p.points, portal, corners)
-        hidden = shading.shade_portal(lamp_slices, moved, points, points, views)
+        hidden = shading.shade(lamp_slices, moved, shading.Surface(points, views, points))
         return jnp.concatenate([sky - hidden, lamp[..., None]], axis=-1).mean(axis=1)
 
     return images

@@ -48,7 +48,7 @@ def chain(picture: _fit.Picture, environment: models.Environment, degree: int) -
     def image(parameters: jax.Array) -> jax.Array:
         # The quadrature's own estimate is of the worst slice, next to the horizon, which no pixel shows: not asked for.
         slices = shading.tabulate_brdf(material(parameters), degree, **options, throw=False)
-        return shading.shade_environment(slices, light, normals, views, tangents).mean(axis=1)
+        return shading.shade(slices, models.DistantLight(light), shading.Surface(normals, views, tangents)).mean(axis=1)
 
     return image
 

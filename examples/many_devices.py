@@ -51,7 +51,7 @@ def make_scene(path: Path, degree: int, pixels: int) -> None:
 
 
 def loss(light, normals, material, views):
-    return jnp.sum(shading.shade_environment(material, light, normals, views) ** 2)
+    return jnp.sum(shading.shade(material, models.DistantLight(light), shading.Surface(normals, views)) ** 2)
 
 
 def worker(folder: Path, process: int) -> None:

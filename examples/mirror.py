@@ -43,17 +43,17 @@ def run(output: Path, size: int) -> list[dict]:
     for name in ("sphere", "rabbit"):
         view, eye = look(name, size)
         normals, positions = view.picture(view.normals), view.picture(view.positions)
-        footprint = shading.mirror_footprint(normals.astype(np.float32), positions.astype(np.float32), eye, view.seen)
+        footprint = shading.footprint(normals.astype(np.float32), positions.astype(np.float32), eye, view.seen)
         for room in MAPS:
             environment, exposure = load_map(room), MAPS[room][1]
-            maps = shading.prefilter_mirror(environment.texels)
+            maps = shading.MirrorMaps.from_texels(environment.texels)
             light = harmonics.apply_window(environment.coefficients(DEGREE), harmonics.hann_window(DEGREE))
             truth = sampled(name, environment, size, MANY)
             images = {
                 "1 sample": environment.radiance(footprint.directions, texels="samples"),
                 f"{SAMPLES} x {SAMPLES} samples": sampled(name, environment, size, SAMPLES),
-                "round Gaussian": shading.shade_mirror(footprint, light),
-                "filtered maps": shading.shade_prefiltered_mirror(footprint, maps),
+                "round Gaussian": shading.reflect(footprint, models.DistantLight(light)),
+                "filtered maps": shading.reflect(footprint, maps),
                 f"{MANY} x {MANY} samples": truth,
             }
             middle = slice(size // 4, size - size // 4)

@@ -126,7 +126,9 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
 
     def shade(case):
         material, light, degree = case
-        return shading.shade_environment(slices[material], coefficients[light, degree], normals, views)
+        return shading.shade(
+            slices[material], models.DistantLight(coefficients[light, degree]), shading.Surface(normals, views)
+        )
 
     coefficients = {(name, d): environments[name].coefficients(d) for name in environments for d in degrees}
     images, rows = {}, []

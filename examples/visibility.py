@@ -36,7 +36,11 @@ def run(output: Path, size: int, samples: int, rays: int, seed: int) -> list[dic
     for name in tqdm(MAPS, "maps"):
         environment, exposure = load_map(name), MAPS[name][1]
         light = environment.coefficients(DEGREE + max(SEEN))
-        images = {"no occlusion": shading.shade_environment(material, light, view.normals, view.views)}
+        images = {
+            "no occlusion": shading.shade(
+                material, models.DistantLight(light), shading.Surface(view.normals, view.views)
+            )
+        }
         for degree, v in seen.items():
             images[f"degree {degree}"] = shading.shade_environment_visibility(
                 material, light, v, view.normals, view.views, **where

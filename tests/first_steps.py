@@ -25,8 +25,8 @@ def radiance(roughness):
     """What two points send back of distant light and of a lamp, and their sum."""
     lobes = shading.tabulate_brdf(models.Ggx(roughness), DEGREE)
     lamp = models.PolygonLight(LAMP, two_sided=True)
-    distant = shading.shade_environment(lobes, LIGHT, NORMALS, VIEWS)
-    near = shading.shade_polygon(lobes, lamp, np.zeros_like(NORMALS), NORMALS, VIEWS)
+    distant = shading.shade(lobes, models.DistantLight(LIGHT), shading.Surface(NORMALS, VIEWS))
+    near = shading.shade(lobes, lamp, shading.Surface(NORMALS, VIEWS, np.zeros_like(NORMALS)))
     return (distant + near).sum(), {"distant": distant, "near": near}
 
 

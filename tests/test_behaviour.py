@@ -123,7 +123,7 @@ blocks = lambda: shading.BrdfMatrix(
     tuple(jnp.asarray(normal(3, 3 - m, 3 - m)) for m in range(3)), jnp.zeros((), np.float32), 2, 2, True
 )
 visibility = lambda: models.Visibility(normal(3, 9), np.array([[0, 1, 2]]))
-footprint = lambda: shading.MirrorFootprint(W, normal(N, 3, 2) * np.float32(0.1))
+footprint = lambda: shading.Footprint(W, normal(N, 3, 2) * np.float32(0.1))
 environment = lambda: models.Environment(MAP)
 rotated = lambda: decomposition.ZonalLobes(W[:2], normal(3, 3, 2))
 
@@ -134,7 +134,7 @@ def lobes(domain="sphere"):
 
 @functools.cache
 def prefiltered():
-    return shading.prefilter(lobes(), normal(3, 9))
+    return shading.prefilter(lobes(), models.DistantLight(normal(3, 9)))
 
 
 BRDFS = {
@@ -412,25 +412,25 @@ CASES = [
     ),
     Case(
         "shading.BrdfMatrix.slices",
-        lambda m: m.slices(views=4).coefficients,
+        lambda m: m.slices(elevations=4).coefficients,
         lambda: (blocks(),),
         idle=("quadrature_error",),
     ),
     Case(
-        "shading.MirrorFootprint.from_derivatives",
-        shading.MirrorFootprint.from_derivatives,
+        "shading.Footprint.from_derivatives",
+        shading.Footprint.from_derivatives,
         lambda: (NORMALS, POSITIONS, PANEL[0], normal(N, 3, 2), normal(N, 3, 2)),
         (0, 1, 3, 4),
     ),
     Case(
-        "shading.mirror_footprint",
-        lambda n, x, e: shading.mirror_footprint(n, x, e, np.ones((2, 2), bool)),
+        "shading.footprint",
+        lambda n, x, e: shading.footprint(n, x, e, np.ones((2, 2), bool)),
         lambda: (NORMALS.reshape(2, 2, 3), POSITIONS.reshape(2, 2, 3), PANEL[0]),
     ),
     Case("shading.band_energies", shading.band_energies, lambda: (lobes(),), idle=("quadrature_error",)),
     Case(
         "shading.tabulate_brdf",
-        lambda f: shading.tabulate_brdf(f, 2, views=4, quadrature=48, throw=False),
+        lambda f: shading.tabulate_brdf(f, 2, elevations=4, quadrature=48, throw=False),
         lambda: (BRDFS["Phong"](),),
         heavy=True,
     ),
@@ -459,7 +459,7 @@ CASES = [
     ),
     Case(
         "shading.shade_environment_visibility",
-        lambda l, e, v, n, o: shading.shade_environment_visibility(l, e, v, n, o),
+        lambda l, e, v, n, o: shading.shade(l, models.Occluded(models.DistantLight(e), v), shading.Surface(n, o)),
         lambda: (lobes(), normal(3, 9), normal(N, 9), NORMALS, VIEWS),
         (2, 3, 4),
         heavy=True,
@@ -512,7 +512,7 @@ CASES = [
     ),
     Case(
         "shading.prefilter",
-        lambda l, e, like: shading.prefilter(l, e, like=like),
+        lambda l, e, like: shading.prefilter(l, models.DistantLight(e), like=like),
         lambda: (lobes(), normal(3, 9), prefiltered()),
         heavy=True,
         idle=("*",),  # the channels of `like` are those of values; elsewhere in test_prefiltered
@@ -528,14 +528,14 @@ CASES = [
     Case("shading.shade_mirror", shading.shade_mirror, lambda: (footprint(), normal(3, 9)), (0,), heavy=True),
     Case(
         "shading.prefilter_mirror",
-        lambda t: shading.prefilter_mirror(t, levels=3, degree=2),
+        lambda t: shading.MirrorMaps.from_texels(t, levels=3, degree=2),
         lambda: (MAP,),
         heavy=True,
     ),
     Case(
         "shading.shade_prefiltered_mirror",
         shading.shade_prefiltered_mirror,
-        lambda: (footprint(), shading.prefilter_mirror(MAP, levels=3, degree=2)),
+        lambda: (footprint(), shading.MirrorMaps.from_texels(MAP, levels=3, degree=2)),
         (0,),
         heavy=True,
     ),

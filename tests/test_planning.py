@@ -57,9 +57,9 @@ def general(material, light, degree, positions, normals, views):
     """One light at one degree by the path that always works."""
     if isinstance(light, models.Environment):
         lobes = shading.tabulate_brdf(material, degree)
-        return shading.shade_environment(lobes, light.coefficients(degree), normals, views)
+        return shading.shade(lobes, models.DistantLight(light.coefficients(degree)), shading.Surface(normals, views))
     lobes = shading.tabulate_brdf(material, degree, domain="upper")
-    return shading.shade_polygon(lobes, light, positions, normals, views)
+    return shading.shade(lobes, light, shading.Surface(normals, views, positions))
 
 
 def test_prediction_is_the_mean_over_rotations_and_the_bound_holds(x64, rng):

@@ -82,8 +82,6 @@ def shade(
         named = " and ".join(f"`{name}` {list(c)}" for name, c in colours.items())
         raise ValueError(f"colours of {named} do not broadcast.") from error
     dtype = floating_type((forms, known, points))
-        *(x for x in jax.tree.leaves((forms, known, points)) if jnp.issubdtype(x.dtype, jnp.floating))
-    )
     parts = []
     for (path, group), form, own in zip(groups.items(), as_type(forms, dtype), as_type(points, dtype), strict=True):
         colour = np.broadcast_shapes(form.colour, *(light.colour for light in group))

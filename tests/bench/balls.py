@@ -9,10 +9,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from shisd.models._light import versine
 
 from shisd import models, shading
 from shisd.models import SphereLight
-from shisd.models._light import versine
 from tests.bench.area_lights import lattice
 from tests.bench.timing import interleaved
 

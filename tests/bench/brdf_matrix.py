@@ -72,7 +72,7 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             total = share @ squares
             beyond = float(np.sqrt(max(1 - share @ np.sum(c**2, axis=1) / total, 0)))
             times = []
-            made = {f"table, {v} views": shading.tabulate_brdf(brdf, degree, views=v) for v in TABLES}
+            made = {f"table, {v} views": shading.tabulate_brdf(brdf, degree, elevations=v) for v in TABLES}
             made |= {f"matrix, view degree {v}": shading.project_brdf(brdf, degree, view_degree=v) for v in MATRICES}
             if name in TIMED:
                 shade: dict[Hashable, Callable] = {

@@ -123,12 +123,14 @@ def tables(material: str):
     """Slices by degree, and the seconds of the highest one's table."""
     brdf, most = MATERIALS[material], DEGREES[-1]
     kind = type(brdf).__name__
-    table, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64), kind)
+    table, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, elevations=VIEWS, quadrature=64), kind)
     return {degree: shading.Slices(table.coefficients[..., : (degree + 1) ** 2]) for degree in (2, *DEGREES)}, seconds
 
 
 def shade(parameters, normals, views):
-    return shading.shade_environment(parameters["material"], parameters["light"], normals, views)
+    return shading.shade(
+        parameters["material"], models.DistantLight(parameters["light"]), shading.Surface(normals, views)
+    )
 
 
 def shade_diffuse(parameters, normals, views):
@@ -164,7 +166,7 @@ def sharp_table(material: str, degree: int):
 
 def shade_prefiltered(parameters, normals, views):
     filtered = eqx.tree_at(lambda x: x.maps, parameters["filtered"], parameters["maps"])
-    return shading.shade_prefiltered(filtered, normals, views)
+    return filtered.radiance(shading.Surface(normals, views))
 
 
 def prefiltered(scene: Scene) -> list[Method]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import harmonics, shading
+from shisd import harmonics, models, shading
 from shisd.shading.slices._tabulate import project_slice
 
 BANDS = harmonics._tables.bands
@@ -86,7 +86,7 @@ def methods(material, basis, light):
         "literal": jax.jit(jax.vmap(exact)),
         "tiled": tiled(exact),
         "tables": tiled(lookup),
-        "rotated": jax.jit(lambda n, v: shading.shade_environment(material, light, n, v)),
+        "rotated": jax.jit(lambda n, v: shading.shade(material, models.DistantLight(light), shading.Surface(n, v))),
     }
 
 

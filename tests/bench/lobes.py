@@ -323,9 +323,9 @@ def methods(brdf):
     """name -> (table, seconds to make it, how to take its values, how to shade with it under a light)."""
     made = {}
     most = DEGREES[-1]
-    exact, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, views=VIEWS, quadrature=64, throw=False))
-    shade = lambda slices, light, n, v: shading.shade_environment(
-        slices, light["coefficients"][:, : (slices.degree + 1) ** 2], n, v
+    exact, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, elevations=VIEWS, quadrature=64, throw=False))
+    shade = lambda slices, light, n, v: shading.shade(
+        slices, models.DistantLight(light["coefficients"][:, : (slices.degree + 1) ** 2]), shading.Surface(n, v)
     )
     for degree in DEGREES:
         slices = shading.Slices(exact.coefficients[..., : (degree + 1) ** 2])

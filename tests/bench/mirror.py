@@ -105,7 +105,7 @@ def reflected(name: str, shade: Callable) -> tuple[Callable, Callable]:
     seen = np.nonzero(of.seen)
     arguments = tuple(jnp.asarray(a) for a in (of.normals, of.positions, of.eye, of.seen))
     chosen = jax.jit(lambda footprint: jax.tree.map(lambda a: a[seen], footprint))
-    make = lambda: chosen(shading.mirror_footprint(*arguments, filter_width=WIDTH))
+    make = lambda: chosen(shading.footprint(*arguments, filter_width=WIDTH))
     footprint = make()
     return lambda: shade(footprint), lambda: shade(make())
 
@@ -136,7 +136,7 @@ def methods(name: str, room: str, degrees: tuple[int, ...] = DEGREES) -> dict[st
             found[f"round, {of_light}"] = reflected(name, shade)
             if degree <= 60:
                 found[f"as it is, {of_light}"] = reflected(name, functools.partial(shade, anisotropic=True))
-    maps = shading.prefilter_mirror(environment(room).texels)
+    maps = shading.MirrorMaps.from_texels(environment(room).texels)
     found["filtered maps"] = reflected(name, functools.partial(shading.shade_prefiltered_mirror, maps=maps))
     return found
 
@@ -185,14 +185,14 @@ def _costs() -> list[dict]:
     rng = np.random.default_rng(0)
     directions = jnp.asarray(unit(rng.normal(size=(8192, 3))), jnp.float32)
     axes = jnp.asarray(rng.uniform(0, 0.1, (8192, 1, 1)) * np.ones((1, 3, 2)), jnp.float32)
-    footprint, rows = shading.MirrorFootprint(directions, axes), []
+    footprint, rows = shading.Footprint(directions, axes), []
     for degree in DEGREES:
         e = light("interior", degree)
         calls = {
-            "shade_mirror": lambda e=e: shading.shade_mirror(footprint, e),
+            "shade_mirror": lambda e=e: shading.reflect(footprint, models.DistantLight(e)),
             "sh_basis and sum": jax.jit(lambda e=e, degree=degree: harmonics.sh_basis(directions, degree) @ e.T),
             "evaluate": lambda e=e: harmonics.evaluate(e[:, None], directions),
-            "anisotropic": lambda e=e: shading.shade_mirror(footprint, e, anisotropic=True),
+            "anisotropic": lambda e=e: shading.reflect(footprint, models.DistantLight(e), anisotropic=True),
         }
         times = {name: t.best / 8192 * 1e6 for name, t in interleaved(calls, seconds=0.5).items()}
         rows.append({

@@ -71,11 +71,11 @@ def truth_of(brdf, light, where):
 def general(brdf, light, degree, views=64):
     """A function of pixels: one light by the path that always works."""
     if isinstance(light, models.PolygonLight):
-        material = shading.tabulate_brdf(brdf, degree, views=views, domain="upper", throw=False)
-        return lambda p, n, v: shading.shade_polygon(material, light, p, n, v)
-    material = shading.tabulate_brdf(brdf, degree, views=views, throw=False)
+        material = shading.tabulate_brdf(brdf, degree, elevations=views, domain="upper", throw=False)
+        return lambda p, n, v: shading.shade(material, light, shading.Surface(n, v, p))
+    material = shading.tabulate_brdf(brdf, degree, elevations=views, throw=False)
     e = light.coefficients(degree) if isinstance(light, models.Environment) else light
-    return lambda p, n, v: shading.shade_environment(material, e, n, v)
+    return lambda p, n, v: shading.shade(material, models.DistantLight(e), shading.Surface(n, v))
 
 
 def bench_prediction(degrees=(4, 8, 16), count=1024, names=("interior", "studio")):

@@ -199,13 +199,15 @@ def _shade_sphere(parameters):
     material, light, rays = parameters
     _, normals, views, hit = meet("sphere", rays)
     normals = jnp.where(hit[:, None], normals, views)
-    return jnp.where(hit[:, None], shading.shade_environment(material, light, normals, views), 0)
+    return jnp.where(
+        hit[:, None], shading.shade(material, models.DistantLight(light), shading.Surface(normals, views)), 0
+    )
 
 
 def _shade_floor(parameters):
     material, light, rays = parameters
     points, normals, views, _ = meet("floor", rays)
-    return shading.shade_polygon(material, light, points, normals, views)
+    return shading.shade(material, light, shading.Surface(normals, views, points))
 
 
 @functools.cache

@@ -95,8 +95,8 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     light = models.PolygonLight(local_lights.QUADS["wall"])
     for degree in (8, 16, 30):
         e = jnp.asarray(np.random.default_rng(1).normal(size=(3, (degree + 1) ** 2)), jnp.float32)
-        fitted = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, views=VIEWS, domain="upper")
-        one = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, views=VIEWS)
+        fitted = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, elevations=VIEWS, domain="upper")
+        one = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, elevations=VIEWS)
         rgb = shading.tabulate_brdf(models.Ggx(0.25, np.array([0.9, 0.6, 0.3])), degree, views=VIEWS)
         shade = lambda m, e=e: functools.partial(shading.shade_environment, m, e, normals, views)
         functions = {

@@ -65,7 +65,12 @@ def bench_equation_22(degrees=(4, 8, 16, 30)):
                 "first call s": times[name].first,
             })  # fmt: skip
         gradient = jax.jit(
-            jax.grad(lambda n, v, m=material, light=light: jnp.sum(shading.shade_environment(m, light, n, v)), (0, 1))
+            jax.grad(
+                lambda n, v, m=material, light=light: jnp.sum(
+                    shading.shade(m, models.DistantLight(light), shading.Surface(n, v))
+                ),
+                (0, 1),
+            )
         )
         forward = candidates["rotated"]
         times = interleaved({"gradient": gradient, "forward": forward}, normals[:count], views[:count])
@@ -88,7 +93,7 @@ def memory_child(degree):
     material = shading.tabulate_brdf(models.Ggx(0.3), degree)
     light = rng.normal(size=(3, (degree + 1) ** 2)).astype(np.float32)
     before = peak()
-    jax.block_until_ready(shading.shade_environment(material, light, normals, normals))
+    jax.block_until_ready(shading.shade(material, models.DistantLight(light), shading.Surface(normals, normals)))
     print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
 
 

@@ -406,7 +406,9 @@ def roughness_rows():
             @jax.jit
             @functools.partial(jax.value_and_grad, argnums=(0, 1, 2))
             def radiance(alpha, normal, view, e):
-                return shading.shade_environment(tabulated(models.Ggx(alpha, 0.04), e.dtype), e, normal, view)
+                return shading.shade(
+                    tabulated(models.Ggx(alpha, 0.04), e.dtype), models.DistantLight(e), shading.Surface(normal, view)
+                )
 
             distant = models.Environment.from_function(lambda w: jnp.asarray(light(np.asarray(w, float)), w.dtype), 256)
             for name, (alpha, view) in cases.items():
@@ -538,7 +540,7 @@ def light_rows():
             @functools.partial(jax.grad, argnums=(0, 1, 2), has_aux=True)
             def shade(texels, normals, views, material=material, weights=weights):
                 light = models.Environment(texels).coefficients(SHADING_DEGREE)
-                radiance = shading.shade_environment(material, light, normals, views)
+                radiance = shading.shade(material, models.DistantLight(light), shading.Surface(normals, views))
                 return weights @ radiance, radiance
 
             surface = [jnp.asarray(x, dtype) for x in (normals, views)]

@@ -84,8 +84,8 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             rms = float(np.sqrt(np.mean(np.asarray(truth.value, float) ** 2)))
             e = {degree: light.coefficients(degree + OF_SLICES) for degree in (0, *seen, FINE)}
             shaded = {
-                ("no occlusion", ""): lambda material=material, e=e: shading.shade_environment(
-                    material, e[0], view.normals, view.views
+                ("no occlusion", ""): lambda material=material, e=e: shading.shade(
+                    material, models.DistantLight(e[0]), shading.Surface(view.normals, view.views)
                 ),
                 **{
                     ("visibility", f"degree {degree}"): functools.partial(

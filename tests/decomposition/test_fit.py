@@ -307,7 +307,7 @@ def test_wrong_arguments_of_sparse_weights(as_user):
 
 def picture_problem(rng, degree=8, views=6):
     """A material of one Gaussian for each view elevation, its picture, and the picture it should give."""
-    exact = shading.tabulate_brdf(models.Ggx(0.4), degree, views=views)
+    exact = shading.tabulate_brdf(models.Ggx(0.4), degree, elevations=views)
     w, areas = harmonics.sphere_rule(2 * degree + 4)
     slices = jnp.stack([harmonics.evaluate(c, w) for c in exact.coefficients])
     fit = lambda y: decomposition.fit_lobes(decomposition.lobe_starts(w, y, areas, 1), w, y, areas).lobes
@@ -321,9 +321,13 @@ def picture_problem(rng, degree=8, views=6):
         directions, log_sharpness, weights = parameters
         lobes = jax.vmap(decomposition.GaussianLobes)(directions, jnp.exp(log_sharpness), weights)
         c = jax.vmap(lambda lobes: lobes.coefficients(degree))(lobes)
-        return shading.shade_environment(shading.Slices(c), light, jnp.asarray(normals[part]), jnp.asarray(seen[part]))
+        return shading.shade(
+            shading.Slices(c),
+            models.DistantLight(light),
+            shading.Surface(jnp.asarray(normals[part]), jnp.asarray(seen[part])),
+        )
 
-    truth = shading.shade_environment(exact, light, jnp.asarray(normals), jnp.asarray(seen))
+    truth = shading.shade(exact, models.DistantLight(light), shading.Surface(jnp.asarray(normals), jnp.asarray(seen)))
 
     def loss(parameters, part):
         return jnp.mean((picture(parameters, part) - truth[part]) ** 2) / jnp.mean(truth[part] ** 2)

@@ -154,9 +154,7 @@ def bad_map():
 
 def test_bad_texels_are_counted_and_clamped(tmp_path):
     write_exr(tmp_path / "bad.exr", bad_map())
-    message = (
-        r"bad.exr: 2 NaN texels set to 0, 1 infinite texel set to 65504, 6 negative texels set to 0, of 128\.$"
-    )
+    message = r"bad.exr: 2 NaN texels set to 0, 1 infinite texel set to 65504, 6 negative texels set to 0, of 128\.$"
     with pytest.warns(UserWarning, match=message):
         texels = np.asarray(Environment.load(tmp_path / "bad.exr").texels)
     expected = np.where(np.isnan(bad_map()) | (bad_map() < 0), 0, np.minimum(bad_map(), 65504))
@@ -264,7 +262,7 @@ def test_sources_that_are_not_known_are_refused(tmp_path, as_user):
     write_exr(tmp_path / "odd.exr", np.ones((3, 6, 3), np.float32))
     for options, message in (
         ({"source": "maya"}, "`source` must be one of 'shisd', 'blender', 'mitsuba'; got 'maya'"),
-        ({"source": "blender", "up": "y"}, "`up` must be \"z\", or \"y\" of source=\"mitsuba\"; got 'y'"),
+        ({"source": "blender", "up": "y"}, '`up` must be "z", or "y" of source="mitsuba"; got \'y\''),
         ({"source": "mitsuba", "up": "z"}, "odd.exr: a height that is even is needed to turn the map; it is 3"),
     ):
         with pytest.raises(ValueError, match=message):

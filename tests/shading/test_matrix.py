@@ -37,7 +37,7 @@ def matrix_of(kind, dtype):
 def both_of(domain, dtype):
     """The table and the matrix of one material, degree 6; 16 views, and 8 degrees more for the views."""
     brdf = models.Ggx(np.asarray(0.4, dtype), np.asarray(0.04, dtype))
-    table = shading.tabulate_brdf(brdf, 6, views=16, domain=domain)
+    table = shading.tabulate_brdf(brdf, 6, elevations=16, domain=domain)
     return table, shading.project_brdf(brdf, 6, domain=domain)
 
 
@@ -88,7 +88,7 @@ def test_elements_are_integrals_over_both_directions(kind, dtype):
 def test_slices_are_those_of_the_table(domain, dtype):
     """The table holds slices of each view, without any expansion over views."""
     table, matrix = both_of(domain, dtype)
-    got, expected = (np.asarray(x.coefficients, float) for x in (matrix.slices(views=16), table))
+    got, expected = (np.asarray(x.coefficients, float) for x in (matrix.slices(elevations=16), table))
     w, area = sphere(20, 40) if domain == "sphere" else hemisphere_rule(20, 40)  # where norms are taken
     norm = lambda c: np.sqrt(np.square(c @ scipy_basis(w, 6).T) @ area)
     ratio = norm(got - expected) / norm(expected)
@@ -123,7 +123,7 @@ def test_radiance_is_the_product_of_slice_and_light(kind, dtype, rng):
     matrix = matrix_of(kind, dtype)
     light, normals, views, tangents = scene(rng, 200, dtype)
     views[0] = normals[0]
-    got = shading.shade_matrix(matrix, light, normals, views, tangents)
+    got = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views, tangents))
     assert got.dtype == dtype and got.shape == (200, 3)
     n, v, t = (unit(a.astype(float)) for a in (normals, views, tangents))
     t = unit(t - np.sum(t * n, axis=1, keepdims=True) * n)
@@ -142,14 +142,16 @@ def test_radiance_is_the_product_of_slice_and_light(kind, dtype, rng):
 def test_matrix_and_table_shade_alike(rng):
     matrix = matrix_of("isotropic", SINGLE)
     light, normals, views, _ = scene(rng, 200, np.float32)
-    expected = shading.shade_environment(matrix.slices(), light, normals, views)
-    got = shading.shade_matrix(matrix, light, normals, views)
+    expected = shading.shade(matrix.slices(), models.DistantLight(light), shading.Surface(normals, views))
+    got = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views))
     np.testing.assert_allclose(got, expected, atol=1e-4 * np.max(np.abs(expected)))
-    low = shading.shade_matrix(matrix, light[:, :4], normals, views)  # a light of fewer bands
+    low = shading.shade(
+        matrix, models.DistantLight(light[:, :4]), shading.Surface(normals, views)
+    )  # a light of fewer bands
     padded = np.where(np.arange(N) < 4, light, np.float32(0))
-    expected = shading.shade_matrix(matrix, padded, normals, views)
+    expected = shading.shade(matrix, models.DistantLight(padded), shading.Surface(normals, views))
     np.testing.assert_allclose(low, expected, atol=2e-6 * np.max(np.abs(low)))
-    below = shading.shade_matrix(matrix, light, normals, -normals)
+    below = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, -normals))
     assert np.all(np.asarray(below) == 0)
 
 
@@ -182,7 +184,9 @@ def test_lambertian(x64):
     matrix = shading.project_brdf(models.Lambertian(1.0), 8, view_degree=0)
     assert [b.shape for b in matrix.blocks] == [(9, 1)]
     light = np.r_[np.sqrt(4 * np.pi), np.zeros(15)]  # radiance 1 from everywhere
-    np.testing.assert_allclose(shading.shade_matrix(matrix, light, np.eye(3), np.eye(3)), 1, rtol=1e-8)
+    np.testing.assert_allclose(
+        shading.shade(matrix, models.DistantLight(light), shading.Surface(np.eye(3), np.eye(3))), 1, rtol=1e-8
+    )
     energy = shading.band_energies(matrix)
     assert energy.shape == (64, 9)
     np.testing.assert_allclose(energy, np.broadcast_to(expected, (64, 9)), atol=1e-8)
@@ -222,16 +226,16 @@ def test_errors_name_the_argument(as_user, rng):
     matrix = shading.BrdfMatrix((jnp.ones((N, 1)),), jnp.zeros(()), DEGREE, 0, False)
     light, normals, views, _ = scene(rng, 2, np.float32)
     with pytest.raises(ValueError, match=r"`matrix` must come from shading.project_brdf; got int"):
-        shading.shade_matrix(1, light, normals, views)
+        shading.shade(1, models.DistantLight(light), shading.Surface(normals, views))
     with pytest.raises(ValueError, match="`light_coefficients` must have"):
-        shading.shade_matrix(matrix, light[:, :5], normals, views)
+        shading.shade(matrix, models.DistantLight(light[:, :5]), shading.Surface(normals, views))
     with pytest.raises(ValueError, match=r"batch axes .* do not broadcast"):
-        shading.shade_matrix(matrix, light, normals, np.zeros((3, 3), np.float32), views)
+        shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, np.zeros((3, 3), np.float32), views))
     upper = shading.BrdfMatrix(matrix.blocks, jnp.zeros(()), DEGREE, 0, True, "upper")
     with pytest.raises(ValueError, match="`matrix` was fitted above the horizon only"):
-        shading.shade_matrix(upper, light, normals, views)
+        shading.shade(upper, models.DistantLight(light), shading.Surface(normals, views))
     with pytest.raises(ValueError, match=r"`tangents` \[..., 3\] are needed"):
-        shading.shade_matrix(matrix, light, normals, views)
+        shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views))
     with pytest.raises(ValueError, match="`basis` must be a decomposition.RotatedZonalBasis of degree 3"):
         matrix.slices().weights(decomposition.RotatedZonalBasis(decomposition.optimized_directions(2), 2))
     with pytest.raises(ValueError, match="`material` must come from shading.tabulate_brdf or shading.project_brdf"):
@@ -248,7 +252,7 @@ def test_degenerate_views_and_normals(rng):
     matrix = matrix_of("isotropic", SINGLE)
     light, normals, views, _ = scene(rng, 3, np.float32)
     normals[0], views[1] = 0, np.nan
-    got = np.asarray(shading.shade_matrix(matrix, light, normals, views))
+    got = np.asarray(shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views)))
     assert np.all(np.isnan(got[:2])) and np.all(np.isfinite(got[2]))
-    empty = shading.shade_matrix(matrix, light, normals[:0], views[:0])
+    empty = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals[:0], views[:0]))
     assert empty.shape == (0, 3)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from shisd import harmonics, shading
+from shisd import harmonics, models, shading
 from tests.hard_cases import unit
 from tests.marks import FLOAT32_FIRST, FLOAT64_FIRST
 from tests.truth import scipy_basis
@@ -66,7 +66,7 @@ def exact_axes(size, surface, width=0.5, step=1e-4):
 def made(size, surface, dtype, seen=None):
     n, x = on_surface(*pixel_grid(size), size, surface)
     seen = np.ones((size, size), bool) if seen is None else seen
-    return shading.mirror_footprint(n.astype(dtype), x.astype(dtype), EYE.astype(dtype), seen)
+    return shading.footprint(n.astype(dtype), x.astype(dtype), EYE.astype(dtype), seen)
 
 
 @FLOAT64_FIRST
@@ -96,7 +96,7 @@ def test_footprints_from_derivatives_are_exact(x64):
     )
     n, x = at(0, 0)
     directions, axes = exact_axes(size, SURFACES["saddle"], width=0.7)
-    got = shading.MirrorFootprint.from_derivatives(3 * n, x, EYE, 3 * dn, dx, filter_width=0.7)
+    got = shading.Footprint.from_derivatives(3 * n, x, EYE, 3 * dn, dx, filter_width=0.7)
     np.testing.assert_allclose(got.directions, directions, atol=1e-13)
     np.testing.assert_allclose(got.axes, axes, atol=1e-9)
 
@@ -110,7 +110,7 @@ def test_surfaces_do_not_mix_at_a_silhouette(dtype):
     n, x = (np.where(cover[..., None], a, b) for a, b in zip(
         on_surface(*pixel_grid(size), size, near), on_surface(*pixel_grid(size), size, SURFACES["sphere"]), strict=True
     ))  # fmt: skip
-    got = shading.mirror_footprint(n.astype(dtype), x.astype(dtype), EYE.astype(dtype), np.ones_like(cover))
+    got = shading.footprint(n.astype(dtype), x.astype(dtype), EYE.astype(dtype), np.ones_like(cover))
     axes = np.where(cover[..., None, None], exact_axes(size, near)[1], exact_axes(size, SURFACES["sphere"])[1])
     error = np.linalg.norm(got.axes - axes, axis=(-2, -1)) / np.linalg.norm(axes, axis=(-2, -1))
     assert np.max(error) < 0.05
@@ -128,7 +128,7 @@ def weighted_footprints():
 
     @jax.jit
     def total(n, x, eye, width):
-        footprint = shading.mirror_footprint(n, x, eye, SEEN, filter_width=width)
+        footprint = shading.footprint(n, x, eye, SEEN, filter_width=width)
         return jnp.sum(footprint.axes * weights[..., :2]) + jnp.sum(footprint.directions * weights[..., 2])
 
     return total
@@ -160,7 +160,7 @@ def test_pixels_without_neighbours():
     seen = np.zeros((SIZE, SIZE), bool)
     seen[2, 2] = True
     n, x = (a.astype(np.float32) for a in on_surface(*pixel_grid(SIZE), SIZE, SURFACES["saddle"]))
-    got = shading.mirror_footprint(n, x, EYE.astype(np.float32), seen)
+    got = shading.footprint(n, x, EYE.astype(np.float32), seen)
     np.testing.assert_array_equal(got.axes, 0)
     np.testing.assert_array_equal(np.asarray(got.directions)[~seen], np.broadcast_to([0, 0, -1], (SIZE**2 - 1, 3)))
     expected = mirror_directions(*pixel_grid(SIZE), SIZE, SURFACES["saddle"])[2, 2]
@@ -205,8 +205,8 @@ def test_filters_against_quadrature(anisotropic, dtype, rng):
             continue
         r, axes = footprints(rng, major, ratio)
         expected = quadrature(e, r, axes, DEGREE)
-        footprint = shading.MirrorFootprint(r.astype(dtype), axes.astype(dtype))
-        got = shading.shade_mirror(footprint, e.astype(dtype), anisotropic=anisotropic)
+        footprint = shading.Footprint(r.astype(dtype), axes.astype(dtype))
+        got = shading.reflect(footprint, models.DistantLight(e.astype(dtype)), anisotropic=anisotropic)
         assert got.dtype == dtype and got.shape == (12, 3)
         # of the largest radiance; a round Gaussian is one factor for each band either way
         tolerance = (2e-6 if dtype == np.float32 else 1e-12) + (0.06 if ratio == 1 else 0.15) * major**2
@@ -216,7 +216,7 @@ def test_filters_against_quadrature(anisotropic, dtype, rng):
 def test_round_is_the_mean_over_turns(x64, rng):
     """One Gaussian of the mean variance keeps what does not depend on orientation, to first order."""
     e, (r, axes) = light(rng, DEGREE), footprints(rng, 0.1, 0.5)
-    got = shading.shade_mirror(shading.MirrorFootprint(r, axes), e)
+    got = shading.reflect(shading.Footprint(r, axes), models.DistantLight(e))
     turned = np.stack([axes, np.cross(r[:, :, None], axes, axis=1)])
     expected = np.mean([quadrature(e, r, a, DEGREE) for a in turned], axis=0)
     np.testing.assert_allclose(got, expected, atol=3e-3 * np.max(np.abs(expected)))
@@ -234,7 +234,9 @@ def test_the_gauss_weierstrass_kernel_is_nearer_than_others():
     l = np.arange(degree + 1)
     axes = width * np.eye(3)[:, :2]
     e = np.stack([np.eye((degree + 1) ** 2)[k * k + k] / np.sqrt((2 * k + 1) / (4 * np.pi)) for k in l])
-    ours = shading.shade_mirror(shading.MirrorFootprint(np.float32([0, 0, 1]), np.float32(axes)), np.float32(e))
+    ours = shading.reflect(
+        shading.Footprint(np.float32([0, 0, 1]), np.float32(axes)), models.DistantLight(np.float32(e))
+    )
     assert np.max(np.abs(ours - true)) < 0.07 * width**2 < np.max(np.abs(von_mises_fisher - true))
 
 
@@ -247,7 +249,7 @@ def test_degree_100_in_float32(rng):
     kept = np.exp(-np.outer(variance, l * (l + 1)) / 2)
     r32 = r.astype(np.float32)
     expected = np.einsum("pn,cn->pc", kept * scipy_basis(r32.astype(float), degree), e)
-    got = shading.shade_mirror(shading.MirrorFootprint(r32, axes.astype(np.float32)), e)
+    got = shading.reflect(shading.Footprint(r32, axes.astype(np.float32)), models.DistantLight(e))
     np.testing.assert_allclose(got, expected, atol=5e-5 * np.max(np.abs(expected)))
 
 
@@ -262,9 +264,7 @@ def hard_footprints(rng):
 
 def filter_of(r, e, anisotropic):
     """Radiance by tangent vectors at `r`, axes and light."""
-    return jax.jit(lambda v, axes, e: shading.shade_mirror(
-        shading.MirrorFootprint(r + v - jnp.sum(v * r, axis=1, keepdims=True) * r, axes), e, anisotropic=anisotropic
-    ))  # fmt: skip
+    return jax.jit(lambda v, axes, e: shading.reflect(shading.Footprint(r + v - jnp.sum(v * r, axis=1, keepdims=True) * r, axes), models.DistantLight(e), anisotropic=anisotropic))  # fmt: skip
 
 
 @pytest.mark.slow
@@ -290,7 +290,9 @@ def test_tiles_and_batches(anisotropic, rng):
     e, (r, axes) = light(rng, 3).astype(np.float32), footprints(rng, 0.1, 0.5, count=530)
     r, axes = r.astype(np.float32), axes.astype(np.float32)
     axes[7] = np.nan
-    shade = jax.jit(lambda r, a: shading.shade_mirror(shading.MirrorFootprint(r, a), e, anisotropic=anisotropic))
+    shade = jax.jit(
+        lambda r, a: shading.reflect(shading.Footprint(r, a), models.DistantLight(e), anisotropic=anisotropic)
+    )
     whole = shade(r, axes)
     assert np.all(np.isnan(whole[7])) and np.all(np.isfinite(np.delete(whole, 7, axis=0)))
     np.testing.assert_allclose(jax.vmap(shade)(r[:4].reshape(2, 2, 3), axes[:4].reshape(2, 2, 3, 2)).reshape(4, 3),
@@ -304,12 +306,12 @@ def test_tiles_and_batches(anisotropic, rng):
 def test_filtered_maps_against_quadrature(rng):
     degree, height = 8, 128
     e = light(rng, degree).astype(np.float32)
-    maps = shading.prefilter_mirror(harmonics.synthesize_map(e, height), levels=25)
+    maps = shading.MirrorMaps.from_texels(harmonics.synthesize_map(e, height), levels=25)
     for major, ratio, tolerance in ((0, 1, 2e-3), (0.1, 1, 3e-3), (0.15, 0.5, 4e-3), (0.2, 0.25, 2e-2)):
         r, axes = footprints(rng, major, ratio)
         expected = quadrature(e, r, axes, degree)
-        footprint = shading.MirrorFootprint(r.astype(np.float32), axes.astype(np.float32))
-        got = shading.shade_prefiltered_mirror(footprint, maps)
+        footprint = shading.Footprint(r.astype(np.float32), axes.astype(np.float32))
+        got = shading.reflect(footprint, maps)
         error = np.max(np.abs(got - expected)) / np.max(np.abs(expected))
         assert error < tolerance, f"{major} {ratio}: {error}"
 
@@ -317,35 +319,35 @@ def test_filtered_maps_against_quadrature(rng):
 @pytest.mark.slow
 def test_derivatives_of_filtered_maps(x64, rng):
     """Within texels, of round, pointlike and thin footprints; the direction of a point is that of its texel."""
-    maps = shading.prefilter_mirror(harmonics.synthesize_map(light(rng, 4), 16), levels=5)
+    maps = shading.MirrorMaps.from_texels(harmonics.synthesize_map(light(rng, 4), 16), levels=5)
     r, axes = footprints(rng, 0.3, 0.4, count=6)
     axes[2], axes[3] = footprints(rng, 0.2, 1, count=6)[1][2], 0
-    shade = jax.jit(lambda r, a: shading.shade_prefiltered_mirror(shading.MirrorFootprint(r, a), maps))
+    shade = jax.jit(lambda r, a: shading.reflect(shading.Footprint(r, a), maps))
     check_grads(shade, (jnp.asarray(r[2:]), jnp.asarray(axes[2:])), order=1, atol=1e-5, rtol=1e-5, eps=1e-7)
 
 
 def test_errors_name_the_argument(as_user):
     image, seen, eye = np.ones((4, 5, 3), np.float32), np.ones((4, 5), bool), np.ones(3, np.float32)
-    footprint = shading.MirrorFootprint(jnp.ones((4, 3)), jnp.ones((4, 3, 2)))
+    footprint = shading.Footprint(jnp.ones((4, 3)), jnp.ones((4, 3, 2)))
     cases = [
-        (lambda: shading.mirror_footprint(image, image[:3], eye, seen), r"`normals` and `positions` must have shape"),
-        (lambda: shading.mirror_footprint(image, image, eye, seen.astype(int)), r"`seen` \[H, W\], bool; got"),
-        (lambda: shading.mirror_footprint(image, image, image, seen), r"`eye` must have shape \[3\]"),
-        (lambda: shading.mirror_footprint(image, image, eye, seen, filter_width=eye), "`filter_width` must be"),
+        (lambda: shading.footprint(image, image[:3], eye, seen), r"`normals` and `positions` must have shape"),
+        (lambda: shading.footprint(image, image, eye, seen.astype(int)), r"`seen` \[H, W\], bool; got"),
+        (lambda: shading.footprint(image, image, image, seen), r"`eye` must have shape \[3\]"),
+        (lambda: shading.footprint(image, image, eye, seen, filter_width=eye), "`filter_width` must be"),
         (
-            lambda: shading.MirrorFootprint.from_derivatives(image, image, eye, image, image),
+            lambda: shading.Footprint.from_derivatives(image, image, eye, image, image),
             r"`normal_derivatives` must have shape \[..., 3, 2\]",
         ),
-        (lambda: shading.shade_mirror(image, np.ones(4, np.float32)), "`footprint` must come from shading.mirror_f"),
-        (lambda: shading.shade_mirror(footprint, np.ones(5, np.float32)), "`light_coefficients` must have"),
-        (lambda: shading.MirrorFootprint(eye, image), r"`axes` must have shape \[..., 3, 2\]; got \[4, 5, 3\]"),
+        (lambda: shading.reflect(image, models.DistantLight(np.ones(4, np.float32))), "`footprint` must come from shading.mirror_f"),
+        (lambda: shading.reflect(footprint, models.DistantLight(np.ones(5, np.float32))), "`light_coefficients` must have"),
+        (lambda: shading.Footprint(eye, image), r"`axes` must have shape \[..., 3, 2\]; got \[4, 5, 3\]"),
         (
-            lambda: shading.shade_mirror(shading.MirrorFootprint(image, np.ones((3, 2))), np.ones(4, np.float32)),
+            lambda: shading.reflect(shading.Footprint(image, np.ones((3, 2))), models.DistantLight(np.ones(4, np.float32))),
             r"`footprint.axes` must have shape \[4, 5, 3, 2\]; got \[3, 2\]",
         ),
-        (lambda: shading.shade_prefiltered_mirror(footprint, image), "`maps` must come from shading.prefilter_mirror"),
-        (lambda: shading.prefilter_mirror(image), r"`texels` must have shape \[H, 2H\]"),
-        (lambda: shading.prefilter_mirror(np.ones((4, 8), np.float32), levels=1), "`levels` must be >= 2"),
+        (lambda: shading.reflect(footprint, image), "`maps` must come from shading.prefilter_mirror"),
+        (lambda: shading.MirrorMaps.from_texels(image), r"`texels` must have shape \[H, 2H\]"),
+        (lambda: shading.MirrorMaps.from_texels(np.ones((4, 8), np.float32), levels=1), "`levels` must be >= 2"),
     ]  # fmt: skip
     for call, message in cases:
         with pytest.raises(ValueError, match=message):

@@ -263,7 +263,7 @@ def test_several_lights(rng):
         seen = [models.PolygonLight(q, e) for q, e in zip(quads, emission, strict=False)]
         behind = models.PolygonLight(quads[0][::-1], 7.0)
         both = models.PolygonLight(quads[2][::-1], red, two_sided=True)
-        return shading.shade_polygon(lobes, [*seen, behind, both], position, normal, view)
+        return shading.shade(lobes, [*seen, behind, both], shading.Surface(normal, view, position))
 
     (each, slopes) = zip(*(shade(lobes, q, position, normal, view) for q in quads), strict=True)
     value, pull = jax.vjp(total, quads, emission)
@@ -423,7 +423,7 @@ def test_derivatives(x64, rng):
 
     def radiance(points, emission, position, normal, view):
         light = models.PolygonLight(points, emission)
-        return shading.shade_polygon(lobes, light, position, normal, view)
+        return shading.shade(lobes, light, shading.Surface(normal, view, position))
 
     arguments = (QUAD, np.asarray(1.3), position[1:], normal[1:], view[1:])
     check_grads(radiance, arguments, order=1, rtol=1e-6, atol=1e-8)
@@ -442,7 +442,7 @@ def test_derivatives_of_views_near_the_normal(sine, x64, rng):
 
     def radiance(coefficients, points, view, normal):
         material = eqx.tree_at(lambda m: m.coefficients, lobes, jnp.asarray(coefficients))
-        return shading.shade_polygon(material, models.PolygonLight(points), position[2:], normal[2:], view[2:])
+        return shading.shade(material, models.PolygonLight(points), shading.Surface(normal[2:], view[2:], position[2:]))
 
     arguments = (lobes.coefficients, QUAD, view, normal)
     for i, x in enumerate(arguments):  # a change of all coefficients is rough in the view: not both at a time
@@ -463,9 +463,9 @@ def test_derivatives_of_portals(x64, rng):
 def test_bad_input_is_named(as_user):
     lobes, up = slices("float32"), np.asarray([0, 0, 1], np.float32)
     with pytest.raises(ValueError, match="fitted above the horizon"):
-        shading.shade_environment(lobes, np.ones(9, np.float32), up, up)
+        shading.shade(lobes, models.DistantLight(np.ones(9, np.float32)), shading.Surface(up, up))
     with pytest.raises(ValueError, match="`light` must be"):
-        shading.shade_polygon(lobes, [], up, up, up)
+        shading.shade(lobes, [], shading.Surface(up, up, up))
     with pytest.raises(ValueError, match="at least 3 points"):
         models.PolygonLight(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="`emission` must be"):
@@ -473,7 +473,7 @@ def test_bad_input_is_named(as_user):
     with pytest.raises(ValueError, match="`light` must be"):
         shading.project_light(QUAD, up, 2)
     with pytest.raises(ValueError, match="`portal` must be a models.PortalLight"):
-        shading.shade_portal(lobes, models.PolygonLight(QUAD), up, up, up)
+        shading.shade(lobes, models.PolygonLight(QUAD), shading.Surface(up, up, up))
     with pytest.raises(ValueError, match="do not broadcast"):
         models.PolygonLight(QUAD, np.ones(2), profile=np.ones((3, 4)))
     with pytest.raises(ValueError, match="`domain` must be"):

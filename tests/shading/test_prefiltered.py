@@ -42,7 +42,7 @@ MATERIALS = {
 
 @functools.cache
 def lobes_of(material, dtype):
-    return shading.tabulate_brdf(MATERIALS[material](), DEGREE, views=32)
+    return shading.tabulate_brdf(MATERIALS[material](), DEGREE, elevations=32)
 
 
 @FLOAT32_FIRST
@@ -50,78 +50,82 @@ def lobes_of(material, dtype):
 def test_error_is_as_predicted(material, dtype, rng):
     lobes, e = lobes_of(material, dtype), light(rng).astype(dtype)
     n, v = (x.astype(dtype) for x in directions(rng, 4000))
-    truth = np.asarray(shading.shade_environment(lobes, e, n, v))
+    truth = np.asarray(shading.shade(lobes, models.DistantLight(e), shading.Surface(n, v)))
     for tolerance in (0.1, 0.01, 1e-6):
-        filtered = shading.prefilter(lobes, e, tolerance=tolerance)
-        got = shading.shade_prefiltered(filtered, n, v)
+        filtered = shading.prefilter(lobes, models.DistantLight(e), tolerance=tolerance)
+        got = filtered.radiance(shading.Surface(n, v))
         assert got.dtype == dtype and got.shape == (4000, 3)
         error = np.max(np.sqrt(np.mean((np.asarray(got) - truth) ** 2, axis=0) / np.mean(truth**2, axis=0)))
         predicted = float(filtered.error)
         assert predicted <= tolerance
         assert predicted / 2 - 5e-4 < error < 2 * predicted + 5e-4  # 5e-4: the splines, with all channels
     if material == "glossy":
-        first, other = shading.prefilter(lobes, e), lobes_of("rough", dtype)
-        truth = np.asarray(shading.shade_environment(other, 2 * e[::-1], n, v))
-        filtered = jax.jit(lambda e: shading.prefilter(other, e, like=first))(2 * e[::-1])
-        left = np.asarray(shading.shade_prefiltered(filtered, n, v)) - truth
+        first, other = shading.prefilter(lobes, models.DistantLight(e)), lobes_of("rough", dtype)
+        truth = np.asarray(shading.shade(other, models.DistantLight(2 * e[::-1]), shading.Surface(n, v)))
+        filtered = jax.jit(lambda e: shading.prefilter(other, models.DistantLight(e), like=first))(2 * e[::-1])
+        left = np.asarray(filtered.radiance(shading.Surface(n, v))) - truth
         error = np.max(np.sqrt(np.mean(left**2, axis=0) / np.mean(truth**2, axis=0)))
         assert error > 5 * float(first.error)  # its channels are for another material
         np.testing.assert_allclose(filtered.error, error, rtol=0.2)
     if material == "diffuse":  # view-independent and zonal about the normal
-        assert int(shading.prefilter(lobes, e, tolerance=1e-4).channels) == 1 and not bool(filtered.mirror)
+        assert int(shading.prefilter(lobes, models.DistantLight(e), tolerance=1e-4).channels) == 1 and not bool(
+            filtered.mirror
+        )
 
 
 @pytest.mark.slow
 def test_derivatives_where_frames_turn(x64, rng):
-    filtered = shading.prefilter(lobes_of("glossy", np.dtype("float64")), light(rng), tolerance=1e-2)
+    filtered = shading.prefilter(
+        lobes_of("glossy", np.dtype("float64")), models.DistantLight(light(rng)), tolerance=1e-2
+    )
     axis = np.concatenate([np.eye(3), -np.eye(3), unit(rng.normal(size=(3, 3)))])
     tilted = unit(axis + 0.4 * unit(rng.normal(size=axis.shape)))
     for n, v in ((axis, tilted), (tilted, axis), (axis, axis), (unit(axis + tilted), tilted)):  # last: mirrored to axes
-        check_grads(lambda n, v: shading.shade_prefiltered(filtered, n, v), (n, v), 1, ["fwd", "rev"], 1e-4, 1e-4, 1e-6)
+        check_grads(lambda n, v: filtered.radiance(shading.Surface(n, v)), (n, v), 1, ["fwd", "rev"], 1e-4, 1e-4, 1e-6)
 
 
 @pytest.mark.slow
 def test_tables_are_linear_in_light_and_material_under_jit(x64, rng):
     lobes, e = lobes_of("glossy", np.dtype("float64")), jnp.asarray(light(rng))
-    first = shading.prefilter(lobes, e, tolerance=1e-3)
+    first = shading.prefilter(lobes, models.DistantLight(e), tolerance=1e-3)
     n, v = directions(rng, 50)
 
     @jax.jit
     def radiance(gain, scale):
         bright = eqx.tree_at(lambda x: x.coefficients, lobes, lobes.coefficients * gain)
-        return shading.shade_prefiltered(shading.prefilter(bright, e * scale, like=first), n, v)
+        return shading.prefilter(bright, models.DistantLight(e * scale), like=first).radiance(shading.Surface(n, v))
 
-    np.testing.assert_allclose(radiance(2.0, 3.0), 6 * shading.shade_prefiltered(first, n, v), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(radiance(2.0, 3.0), 6 * first.radiance(shading.Surface(n, v)), rtol=1e-9, atol=1e-9)
     slope = jax.jacrev(radiance, (0, 1))(1.0, 1.0)
     for got in slope:
-        np.testing.assert_allclose(got, shading.shade_prefiltered(first, n, v), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(got, first.radiance(shading.Surface(n, v)), rtol=1e-9, atol=1e-9)
 
 
 def test_no_light_and_views_below(rng):
     lobes = lobes_of("glossy", np.dtype("float32"))
     n, v = (x.astype(np.float32) for x in directions(rng, 5))
-    dark = shading.prefilter(lobes, np.zeros((3, (DEGREE + 1) ** 2), np.float32))
-    assert np.all(np.asarray(shading.shade_prefiltered(dark, n, v)) == 0) and float(dark.error) == 0
-    lit = shading.prefilter(lobes, light(rng).astype(np.float32))
-    assert np.all(np.asarray(shading.shade_prefiltered(lit, n, -v)) == 0)
-    assert np.all(np.isnan(shading.shade_prefiltered(lit, np.zeros_like(n), v)))
+    dark = shading.prefilter(lobes, models.DistantLight(np.zeros((3, (DEGREE + 1) ** 2), np.float32)))
+    assert np.all(np.asarray(dark.radiance(shading.Surface(n, v))) == 0) and float(dark.error) == 0
+    lit = shading.prefilter(lobes, models.DistantLight(light(rng).astype(np.float32)))
+    assert np.all(np.asarray(lit.radiance(shading.Surface(n, -v))) == 0)
+    assert np.all(np.isnan(lit.radiance(shading.Surface(np.zeros_like(n), v))))
 
 
 def test_what_cannot_be_filtered_is_refused(rng, as_user):
     lobes, e = lobes_of("glossy", np.dtype("float32")), light(rng).astype(np.float32)
     for bad in (0.0, np.inf):
         with pytest.raises(ValueError, match="`tolerance` must be finite and > 0"):
-            shading.prefilter(lobes, e, tolerance=bad)
+            shading.prefilter(lobes, models.DistantLight(e), tolerance=bad)
     with pytest.raises(ValueError, match="`light_coefficients` must be finite"):
-        shading.prefilter(lobes, e * np.float32(np.nan))
+        shading.prefilter(lobes, models.DistantLight(e * np.float32(np.nan)))
     with pytest.raises(ValueError, match="pass that as `like`"):
-        jax.jit(lambda e: shading.prefilter(lobes, e).maps)(e)
+        jax.jit(lambda e: shading.prefilter(lobes, models.DistantLight(e)).maps)(e)
     with pytest.raises(ValueError, match="`light_coefficients`"):
-        shading.prefilter(lobes, e[:, :5])
-    other = shading.prefilter(lobes, e[:, :9])
+        shading.prefilter(lobes, models.DistantLight(e[:, :5]))
+    other = shading.prefilter(lobes, models.DistantLight(e[:, :9]))
     with pytest.raises(ValueError, match="at degree 6"):
-        shading.prefilter(lobes, e, like=other)
+        shading.prefilter(lobes, models.DistantLight(e), like=other)
     with pytest.raises(ValueError, match="shading.prefilter"):
-        shading.shade_prefiltered(lobes, e, e)
+        lobes.radiance(shading.Surface(e, e))
     with pytest.raises(ValueError, match="do not broadcast"):
-        shading.shade_prefiltered(other, np.ones((4, 3), np.float32), np.ones((5, 3), np.float32))
+        other.radiance(shading.Surface(np.ones((4, 3), np.float32), np.ones((5, 3), np.float32)))

@@ -86,8 +86,10 @@ def test_a_polygon_of_64_corners_is_nearly_a_ball(x64, rng):
     radius = np.sin(angle) * np.linalg.norm(center)
     views = unit(np.array([[0.0, 0, 1], [0.5, 0.2, 1], [-1, 2, 0.7]]))
     normals, positions = np.broadcast_to([0.0, 0, 1], (3, 3)), np.zeros((3, 3))
-    ball = shading.shade_sphere(lobes, models.SphereLight(center, radius, 1.5), positions, normals, views)
-    flat = shading.shade_polygon(lobes, models.PolygonLight(outline, 1.5, two_sided=True), positions, normals, views)
+    ball = shading.shade(lobes, models.SphereLight(center, radius, 1.5), shading.Surface(normals, views, positions))
+    flat = shading.shade(
+        lobes, models.PolygonLight(outline, 1.5, two_sided=True), shading.Surface(normals, views, positions)
+    )
     np.testing.assert_allclose(ball, flat, rtol=1e-6)
 
 
@@ -99,7 +101,7 @@ def test_several_balls_and_colours(dtype, rng):
               models.SphereLight(np.array([-2.0, 0.2, 1.0], dtype), 1.5)]  # fmt: skip
     normals, positions = unit(rng.normal(size=(4, 3))).astype(dtype), (0.1 * rng.normal(size=(4, 3))).astype(dtype)
     views = unit(normals + 0.5 * rng.normal(size=(4, 3))).astype(dtype)
-    got = shading.shade_sphere(lobes, lights, positions, normals, views)
+    got = shading.shade(lobes, lights, shading.Surface(normals, views, positions))
     expected = 0.0
     for light in lights:
         axes = np.asarray(light.center) - positions
@@ -115,9 +117,13 @@ def test_anisotropic(x64, rng):
     light = models.SphereLight(np.array([0.5, 0.2, 3.0]), 0.7)
     normals, tangents = unit(rng.normal(size=(2, 4, 3)))
     views = unit(normals + 0.5 * rng.normal(size=(4, 3)))
-    got = shading.shade_sphere(lobes, light, np.zeros((4, 3)), normals, views, tangents)
+    got = shading.shade(lobes, light, shading.Surface(normals, views, np.zeros((4, 3)), tangents))
     z = light.zonal_coefficients(np.linalg.norm(light.center), DEGREE)
-    np.testing.assert_allclose(got, shading.shade_zonal(lobes, light.center, z, normals, views, tangents), rtol=1e-11)
+    np.testing.assert_allclose(
+        got,
+        shading.shade(lobes, models.ZonalLight(light.center, z), shading.Surface(normals, views, tangents)),
+        rtol=1e-11,
+    )
 
 
 def test_inside_the_ball_light_is_all_around(x64, rng):
@@ -125,9 +131,9 @@ def test_inside_the_ball_light_is_all_around(x64, rng):
     normals, views = np.array([[0.0, 0, 1]] * 3), unit(np.array([[0.3, 0.1, 1]] * 3))
     positions = np.array([[0.0, 0, 0], [0.5, 0.5, 0.2], [0.0, 0.0, -0.999]])
     ball = lambda radius: models.SphereLight(jnp.zeros(3), radius, 2.0)
-    shade = jax.jit(lambda p, radius: shading.shade_sphere(lobes, ball(radius), p, normals, views))
+    shade = jax.jit(lambda p, radius: shading.shade(lobes, ball(radius), shading.Surface(normals, views, p)))
     constant = np.array([2 * np.sqrt(4 * np.pi)])
-    expected = shading.shade_environment(lobes, constant, normals, views)
+    expected = shading.shade(lobes, models.DistantLight(constant), shading.Surface(normals, views))
     np.testing.assert_allclose(shade(positions, 1.0), expected, rtol=1e-12)
     for gradient in jax.jacobian(shade, argnums=(0, 1))(positions, 1.0):
         np.testing.assert_array_equal(gradient, 0)
@@ -142,7 +148,9 @@ def test_derivatives(x64, rng):
     views[0] = normals[0]
 
     def radiance(center, radius, emission, positions, normals, views):
-        return shading.shade_sphere(lobes, models.SphereLight(center, radius, emission), positions, normals, views)
+        return shading.shade(
+            lobes, models.SphereLight(center, radius, emission), shading.Surface(normals, views, positions)
+        )
 
     arguments = np.array([0.5, 4.0, 2.0]), np.array(1.2), np.array([1.0, 2.0]), positions, normals, views
     arguments = tuple(jnp.asarray(a) for a in arguments)
@@ -162,6 +170,6 @@ def test_errors_name_the_argument(as_user):
     with pytest.raises(ValueError, match="`emission` must be a scalar or"):
         models.SphereLight(np.ones(3), 0.5, np.ones((1, 3)))
     with pytest.raises(ValueError, match="`light` must be a models.SphereLight"):
-        shading.shade_sphere(lobes, models.PolygonLight(np.eye(3)), p, n, n)
+        shading.shade(lobes, models.PolygonLight(np.eye(3)), shading.Surface(n, n, p))
     with pytest.raises(ValueError, match="`positions` must have shape"):
-        shading.shade_sphere(lobes, light, p[:, :2], n, n)
+        shading.shade(lobes, light, shading.Surface(n, n, p[:, :2]))

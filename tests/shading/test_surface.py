@@ -36,7 +36,7 @@ def of_directions(verb):
 def mirror(verb):
     def shade(x, at, mask):
         axes = 0.1 * jnp.stack([at["along_columns"], at["along_rows"]], axis=-1)
-        return verb(shading.MirrorFootprint(at["directions"], axes), x, mask=mask)
+        return verb(shading.Footprint(at["directions"], axes), x, mask=mask)
 
     return shade
 
@@ -54,8 +54,8 @@ ANISOTROPIC = functools.partial(shading.shade_mirror, anisotropic=True)
 EACH = {  # what shades, its light, and which arrays of points it takes
     "environment": (of_directions(lambda *a, **k: shading.shade_environment(sphere(), *a, **k)), HARMONICS, FRAMES),
     "brushed": (
-        lambda x, at, mask: shading.shade_environment(
-            brushed(), x, at["normals"], at["views"], at["tangents"], mask=mask
+        lambda x, at, mask: shading.shade(
+            brushed(), models.DistantLight(x), shading.Surface(at["normals"], at["views"], at["tangents"], mask=mask)
         ),
         HARMONICS,
         (*FRAMES, "tangents"),
@@ -195,7 +195,7 @@ def test_a_tangent_along_the_normal_is_no_frame(rng):
 
 def test_a_new_number_of_points_compiles_nothing_heavy(caplog, rng):
     """Also where gradients are taken outside jit."""
-    loss = lambda e, n, v: jnp.sum(shading.shade_environment(sphere(), e, n, v))
+    loss = lambda e, n, v: jnp.sum(shading.shade(sphere(), models.DistantLight(e), shading.Surface(n, v)))
     sphere()
     run = lambda count: jax.grad(loss)(HARMONICS, *np.float32(unit(rng.normal(size=(2, count, 3)))))
     names = lambda: [r.getMessage().split()[4] for r in caplog.records if "Finished XLA compilation" in r.getMessage()]
@@ -216,9 +216,9 @@ def test_batches_are_filled_up_to_few_sizes():
 def test_masks_are_named_where_they_are_wrong(as_user):
     n = np.ones((3, 3), np.float32)
     with pytest.raises(ValueError, match="`mask` must be bool"):
-        shading.shade_environment(sphere(), HARMONICS, n, n, mask=np.ones(3))
+        shading.shade(sphere(), models.DistantLight(HARMONICS), shading.Surface(n, n, mask=np.ones(3)))
     with pytest.raises(ValueError, match="do not broadcast"):
-        shading.shade_environment(sphere(), HARMONICS, n, n, mask=np.ones(2, bool))
+        shading.shade(sphere(), models.DistantLight(HARMONICS), shading.Surface(n, n, mask=np.ones(2, bool)))
     with pytest.raises(ValueError, match="`mask` .* do not broadcast"):
-        footprint = shading.MirrorFootprint(n, np.ones((3, 3, 2), np.float32))
-        shading.shade_mirror(footprint, HARMONICS, mask=np.ones(2, bool))
+        footprint = shading.Footprint(n, np.ones((3, 3, 2), np.float32))
+        shading.reflect(footprint, models.DistantLight(HARMONICS), mask=np.ones(2, bool))

@@ -126,7 +126,7 @@ def _panels(ends, gauss, weight):
 def test_glossy_dielectrics_are_tabulated_without_help(roughness, x64):
     degree = 30
     brdf = models.CookTorrance(roughness=roughness, metallic=0.0, albedo=0.5)
-    table = shading.tabulate_brdf(brdf, degree, views=4)
+    table = shading.tabulate_brdf(brdf, degree, elevations=4)
     theta = np.array([(2 + 0.5) * np.pi / 8])
     (got,) = np.asarray(table.coefficients)[2:3, : 11**2]
     exact = dense(brdf, theta[0], 10)

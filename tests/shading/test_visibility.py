@@ -46,7 +46,11 @@ def test_it_is_the_integral_of_the_three_expansions(dtype, rng):
     lobes = random_slices(LOBES, dtype)
     e, seen, triangle, weights, frames = scene(rng, dtype)
     normals, views = frames[:, :, 2].astype(dtype), (frames @ VIEW).astype(dtype)
-    got = shading.shade_environment_visibility(lobes, e, seen, normals, views, triangle=triangle, weights=weights)
+    got = shading.shade(
+        lobes,
+        models.Occluded(models.DistantLight(e), seen),
+        shading.Surface(normals, views, triangles=triangle, barycentric=weights),
+    )
     c, v = np.asarray(lobes.coefficients[NODE], float), np.asarray(seen.coefficients, float)
     between = np.einsum("pc,pcn->pn", weights, v[np.asarray(seen.triangles)[triangle]])
     expected = np.stack([quadrature(c, e.astype(float), *x) for x in zip(between, frames, strict=True)])
@@ -54,9 +58,13 @@ def test_it_is_the_integral_of_the_three_expansions(dtype, rng):
     tolerance = (1e-5 if dtype == np.float32 else 1e-12) * np.max(np.abs(expected))
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance)
     points = models.Visibility(seen.at(triangle, weights), np.zeros((0, 3), int))
-    each = shading.shade_environment_visibility(lobes, e, points, normals, views)
+    each = shading.shade(lobes, models.Occluded(models.DistantLight(e), points), shading.Surface(normals, views))
     np.testing.assert_allclose(each, expected, rtol=0, atol=tolerance)
-    one = shading.shade_environment_visibility(lobes, e[0], seen.at(triangle, weights)[1], normals, views)
+    one = shading.shade(
+        lobes,
+        models.Occluded(models.DistantLight(e[0]), seen.at(triangle, weights)[1]),
+        shading.Surface(normals, views),
+    )
     np.testing.assert_allclose(one[1], expected[1, 0], rtol=0, atol=tolerance)
 
 
@@ -65,11 +73,15 @@ def test_the_triple_product_and_the_shader_of_the_paper_agree(x64, rng):
     lobes = random_slices(LOBES, np.float64)
     e, seen, triangle, weights, frames = scene(rng, np.float64, count=2)
     normals, views = frames[:, :, 2], frames @ VIEW
-    got = shading.shade_environment_visibility(lobes, e, seen, normals, views, triangle=triangle, weights=weights)
+    got = shading.shade(
+        lobes,
+        models.Occluded(models.DistantLight(e), seen),
+        shading.Surface(normals, views, triangles=triangle, barycentric=weights),
+    )
     v = seen.at(triangle, weights)
     product = harmonics.multiply(e[None], v[:, None], LOBES)
     for i in range(2):
-        direct = shading.shade_environment(lobes, product[i], normals[i], views[i])
+        direct = shading.shade(lobes, models.DistantLight(product[i]), shading.Surface(normals[i], views[i]))
         np.testing.assert_allclose(got[i], direct, rtol=1e-11)
     # appendix A: rho = slice in the world, s = gamma rho, radiance = sum of s pi_l (v * y_l^0)(z_k)
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(LOBES), LOBES)
@@ -89,11 +101,11 @@ def test_nothing_hidden_is_the_environment_and_everything_is_dark(dtype, rng):
     e, _, _, _, frames = scene(rng, dtype)
     normals, views = frames[:, :, 2].astype(dtype), (frames @ VIEW).astype(dtype)
     caps = np.asarray(models.cap_visibility(np.array([0, 0, 1], dtype), np.array([0, np.pi], dtype), SEEN))
-    expected = np.asarray(shading.shade_environment(lobes, e, normals, views))
+    expected = np.asarray(shading.shade(lobes, models.DistantLight(e), shading.Surface(normals, views)))
     tolerance = (1e-5 if dtype == np.float32 else 1e-12) * np.max(np.abs(expected))
     for v, right in zip(caps, (expected, 0 * expected), strict=True):
         for each in (v, np.tile(v, (5, 1))):  # of all points, and a row for every point: two ways
-            got = shading.shade_environment_visibility(lobes, e, each, normals, views)
+            got = shading.shade(lobes, models.Occluded(models.DistantLight(e), each), shading.Surface(normals, views))
             np.testing.assert_allclose(got, right, rtol=0, atol=tolerance)
 
 
@@ -117,7 +129,11 @@ def test_derivatives(x64, rng):
 
     def radiance(light, coefficients, weights, normals, views):
         v = models.Visibility(coefficients, seen.triangles)
-        return shading.shade_environment_visibility(lobes, light, v, normals, views, triangle=triangle, weights=weights)
+        return shading.shade(
+            lobes,
+            models.Occluded(models.DistantLight(light), v),
+            shading.Surface(normals, views, triangles=triangle, barycentric=weights),
+        )
 
     arguments = tuple(jnp.asarray(a) for a in (e, seen.coefficients, weights, normals, views))
     check_grads(jax.jit(radiance), arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)

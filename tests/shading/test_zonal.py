@@ -19,7 +19,7 @@ MATERIALS = {  # of the precision of the moment
 
 
 def tabulate(material):
-    return shading.tabulate_brdf(MATERIALS[material](), DEGREE, views=16, azimuths=16)
+    return shading.tabulate_brdf(MATERIALS[material](), DEGREE, elevations=16, azimuths=16)
 
 
 def scene(rng, count, dtype):
@@ -53,8 +53,8 @@ def test_several_lights_add_up(dtype, rng):
     lobes = random_slices(DEGREE, dtype)
     axis, z, normals, views, _ = scene(rng, 20, dtype)
     axes, each = np.stack([axis, -axis[::-1]]), np.stack([z, z[::-1]])
-    got = shading.shade_zonal(lobes, axes, each, normals, views)
-    one = lambda axis, z: np.asarray(shading.shade_zonal(lobes, axis, z, normals, views))
+    got = shading.shade(lobes, models.ZonalLight(axes, each), shading.Surface(normals, views))
+    one = lambda axis, z: np.asarray(shading.shade(lobes, models.ZonalLight(axis, z), shading.Surface(normals, views)))
     expected = one(axes[0], each[0]) + one(axes[1], each[1])
     np.testing.assert_allclose(got, expected, atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)))
 
@@ -63,7 +63,7 @@ def test_eq_24(x64, rng):
     lobes = random_slices(DEGREE, np.float64)
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(DEGREE), DEGREE)
     axis, z, normals, views, _ = scene(rng, 6, np.float64)
-    got = shading.shade_zonal(lobes, axis, z[0], normals, views)
+    got = shading.shade(lobes, models.ZonalLight(axis, z[0]), shading.Surface(normals, views))
     # the sum over rotated axes as it stands: view in the x-z plane of each frame, z_l times Legendre series
     for normal, view, value in zip(normals, views, got, strict=True):
         x = unit(view - (view @ normal) * normal)
@@ -85,10 +85,10 @@ def test_errors_name_the_argument(as_user, rng):
     axis, z, normals, views, _ = scene(rng, 2, np.float32)
     lobes = random_slices(DEGREE, np.float32)
     with pytest.raises(ValueError, match=r"`axis` must have shape \[3\], or \[S, 3\] for S lights; got \[1, 1, 3\]"):
-        shading.shade_zonal(lobes, axis[None, None], z, normals, views)
+        shading.shade(lobes, models.ZonalLight(axis[None, None], z), shading.Surface(normals, views))
     with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape \[L\+1\]"):
-        shading.shade_zonal(lobes, axis, z[None], normals, views)
+        shading.shade(lobes, models.ZonalLight(axis, z[None]), shading.Surface(normals, views))
     with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape \[1, L\+1\] or \[1, colour, L\+1\]"):
-        shading.shade_zonal(lobes, axis[None], z[0], normals, views)
+        shading.shade(lobes, models.ZonalLight(axis[None], z[0]), shading.Surface(normals, views))
     with pytest.raises(ValueError, match="`material` must come from shading.tabulate_brdf"):
-        shading.shade_zonal(1, axis, z, normals, views)
+        shading.shade(1, models.ZonalLight(axis, z), shading.Surface(normals, views))
