@@ -81,12 +81,12 @@ class Visibility(Module):
         """
         return self.coefficients[:, 0] / math.sqrt(4 * np.pi)
 
-    def at(self, triangle: ArrayLike, weights: ArrayLike) -> Float[Array, "*batch n"]:
-        """Coefficients at points of the surface: `triangle` [...], its index; barycentric `weights` [..., 3].
+    def at(self, triangles: ArrayLike, barycentric: ArrayLike) -> Float[Array, "*batch n"]:
+        """Coefficients at points of the surface: the index of each one's triangle [...], and `barycentric` [..., 3].
 
         ValueError for triangles that do not exist, NaN under `jit`.
         """
-        corners, weights = surface_corners(self, triangle, weights)
+        corners, weights = surface_corners(self, triangles, barycentric)
         return by_device(_interpolated, {"corners": corners, "weights": weights}, self.coefficients)
 
     @classmethod
@@ -197,20 +197,20 @@ def cap_visibility(axes: ArrayLike, angles: ArrayLike, degree: int) -> Float[Arr
     return (-cap_coefficients(2 * jnp.sin(angle / 2) ** 2, a, degree)).at[..., 0].add(math.sqrt(4 * np.pi))
 
 
-def surface_corners(visibility: Visibility, triangle: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
+def surface_corners(visibility: Visibility, triangles: ArrayLike, barycentric: ArrayLike) -> tuple[Array, Array]:
     """Vertices and weights [..., 3] of points of the surface; weights are NaN where one of them does not exist."""
-    index, w = _integers("triangle", triangle), _checks.vectors("weights", weights)
+    index, w = _integers("triangles", triangles), _checks.vectors("barycentric", barycentric)
     if index.shape != w.shape[:-1]:
         raise ValueError(
-            f"`triangle` must be integers of the batch shape of `weights` {list(w.shape)}; got shape "
+            f"`triangles` must be integers of the batch shape of `barycentric` {list(w.shape)}; got shape "
             f"{list(index.shape)}."
         )
-    count, triangles = len(visibility.coefficients), visibility.triangles
-    if len(triangles) == 0:
+    count, corners_of = len(visibility.coefficients), visibility.triangles
+    if len(corners_of) == 0:
         raise ValueError("`visibility` has no triangles: it is that of points, whose rows are its `coefficients`.")
-    _check_range("triangle", index, len(triangles), "triangles")
+    _check_range("triangles", index, len(corners_of), "triangles")
     batch = {"index": jnp.asarray(index.astype(np.int32))[..., None], "weights": w}
-    corners, w = by_device(_corners, batch, triangles, count)
+    corners, w = by_device(_corners, batch, corners_of, count)
     return corners, w.astype(visibility.coefficients.dtype)
 
 
