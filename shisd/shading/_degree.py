@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd._typing import Array, Float
-from shisd.harmonics.internal import bands
+from shisd.harmonics.internal import bands, of_order
 from shisd.shading import _views
-from shisd.shading._matrix import BrdfMatrix, of_order
+from shisd.shading._matrix import BrdfMatrix
 from shisd.shading.slices._slices import Slices
 from shisd.shading.slices._upper import RIDGE, hemisphere_blocks
 

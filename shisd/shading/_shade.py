@@ -12,7 +12,7 @@ from shisd.models import DistantLight, Environment, Occluded, PolygonLight, Port
 from shisd.shading._material import Material, as_material
 from shisd.shading._matrix import BrdfMatrix
 from shisd.shading._surface import Surface, check_surface
-from shisd.shading._tiles import as_type, floating_type
+from shisd.shading._tiles import Form, as_type, floating_type
 from shisd.shading.paths import _distant, _occluded, _polygon, _sphere, _zonal
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices
@@ -91,7 +91,7 @@ def shade(
     return functools.reduce(jnp.add, parts)
 
 
-def _known(lights: object) -> list[Light]:
+def _known(lights: Light | Sequence[Light]) -> list[Light]:
     """One light or several, as a list."""
     several = list(lights) if isinstance(lights, Sequence) else [lights]
     if not several:
@@ -110,7 +110,7 @@ def _hint(light: object) -> str:
     return " SH coefficients go into models.DistantLight." if isinstance(light, np.ndarray | jax.Array) else ""
 
 
-def _points(surface: Surface, path: Path, form: Slices | BrdfMatrix) -> dict[str, Array]:
+def _points(surface: Surface, path: Path, form: Form) -> dict[str, Array]:
     """The arrays of the surface that a path uses."""
     names = ["normals", "views"]
     if path.local:

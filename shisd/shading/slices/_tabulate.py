@@ -84,7 +84,7 @@ def table(
     degree: int,
     norms: Norms,
     elevations: int,
-    azimuths: int,
+    azimuths: int | None,
     quadrature: int | None,
     tolerance: float,
     throw: bool,
