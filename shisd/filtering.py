@@ -34,6 +34,7 @@ from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition.internal import gaussian_zonal
 from shisd.harmonics import sh_basis
 from shisd.harmonics.internal import bands, of_order, zonal_norms
+from shisd.io.internal import MERL_BINS, merl_above_horizon, merl_directions
 from shisd.models import MeasuredBrdf, ProjectedBrdf
 from shisd.models.internal import fill_nearest, symmetric
 
@@ -298,11 +299,11 @@ def denoise_merl(
     Cost: at most 60 steps of six products with [90, 90] matrices, for each try and colour.
     """
     table = np.asarray(source, np.float64) if isinstance(source, np.ndarray) else io.read_merl(source)
-    if table.shape != (*io.MERL_BINS, 3):
+    if table.shape != (*MERL_BINS, 3):
         raise ValueError(f"`source` must be a path or a table [90, 90, 180, 3]; got shape {list(table.shape)}.")
     if smoothness is not None:
         smoothness = _checks.number("smoothness", smoothness, positive=True)
-    above = io.merl_above_horizon()[..., None]
+    above = merl_above_horizon()[..., None]
     valid = np.isfinite(table) & (table >= 0) & above
     table = np.where(valid, table, 0)
     if not (table > 0).any(axis=(0, 1, 2)).all():
@@ -400,7 +401,7 @@ def _waves(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _bin_energy() -> np.ndarray:
     """cos_i cos_o dwi dwo of each bin of a MERL table, up to a factor; zero below the horizon."""
-    wi, wo = io.merl_directions()
+    wi, wo = merl_directions()
     theta_h = np.pi / 2 * ((np.arange(90) + 0.5) / 90) ** 2
     theta_d = np.pi / 2 * (np.arange(90) + 0.5) / 90
     solid_angles = np.outer(np.sin(theta_h) * (np.arange(90) + 0.5), np.sin(theta_d) * np.cos(theta_d))

@@ -10,6 +10,7 @@ from jax.test_util import check_grads
 from scipy.special import ive
 
 from shisd import filtering, io, models
+from shisd.io.internal import merl_above_horizon
 from tests.marks import FLOAT32_FIRST
 from tests.models.materials import GOLD_PAINT, albedos, array, evaluate, hemisphere, pairs, spherical, spoiled
 from tests.truth import scipy_basis
@@ -201,7 +202,7 @@ def test_errors_say_what_to_pass(as_user):
 def check_denoised(brdf, path, rng, smoothness):
     """Three times less RMS error than the noise, albedo to 1 %, reciprocity to 1e-12."""
     io.write_merl(path, brdf)
-    clean, above = io.read_merl(path), io.merl_above_horizon()
+    clean, above = io.read_merl(path), merl_above_horizon()
     io.write_merl(path, spoiled(clean, rng), overwrite=True)
     noisy = io.read_merl(path)
     seen = above & np.all(noisy >= 0, axis=-1)

@@ -10,7 +10,8 @@ from jax.test_util import check_grads
 
 from shisd import harmonics, models, planning, reference, shading
 from shisd.planning._bands import Distant, Material, known_light
-from shisd.planning._prediction import judge
+from shisd.planning._paths import Table
+from shisd.planning._prediction import judge, predict
 from tests.hard_cases import unit
 
 LAMP = np.array([[-0.5, -0.5, 1.5], [-0.5, 0.5, 1.5], [0.5, 0.5, 1.5], [0.5, -0.5, 1.5]], np.float32)
@@ -73,7 +74,7 @@ def test_prediction_is_the_mean_over_rotations_and_the_bound_holds(x64, rng):
     for least in (0, 2):
         products = np.asarray(turned)[:, least**2 :] @ slices[least**2 :]
         s = norms(slices) * (np.arange(degree + 1) >= least)
-        (rms,), (bound,) = planning.predict(s[None, None], norms(light)[None, None], np.ones(1))
+        (rms,), (bound,) = predict(s[None, None], norms(light)[None, None], np.ones(1))
         square = products**2
         noise = np.std(square) / np.mean(square) / np.sqrt(count)
         assert abs(np.mean(square) / rms**2 - 1) < 4 * noise
@@ -162,7 +163,7 @@ def test_errors_are_those_of_the_worst_colour(rng):
     red = energy * [1, 0, 0, 0, 0, 0, 13] / (2 * np.arange(7) + 1)
     material = Material(slices, shares, False, True, 4)
     for degree, expected in ((5, np.sqrt(red[6] / np.sum(red))), (6, 0.0)):
-        np.testing.assert_allclose(judge(planning.Table, material, light, degree).error, expected, rtol=1e-12)
+        np.testing.assert_allclose(judge(Table, material, light, degree).error, expected, rtol=1e-12)
 
 
 def test_what_cannot_be_met_is_said():

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from shisd import decomposition, harmonics, io, models
+from shisd import decomposition, harmonics, models
 from shisd._numerics import normalize
+from shisd.io.internal import write_atomically
 from tests import truth
 from tests.bench.make_directions import band_matrix, worst_condition
 
@@ -164,7 +165,7 @@ def kernels_figure(rows, path):
     panels[0].text(4, 7e15, "1/eps, float64", fontsize=7, color="grey", va="bottom")
     panels[-1].legend(fontsize=7, loc="upper left")
     figure.tight_layout()
-    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
     pyplot.close(figure)
 
 

@@ -22,9 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, io, models, reference, shading
+from shisd import decomposition, harmonics, models, reference, shading
 from shisd._numerics import normalize
 from shisd.decomposition._kernels import gaussian_zonal
+from shisd.io.internal import write_atomically
 from shisd.shading import _surface, _views
 from shisd.shading.slices import _tabulate
 from tests.bench.equation_22 import local_frames
@@ -433,5 +434,5 @@ def figure(rows, path):
     for axes in panels[:, 0]:
         axes.set_ylabel("relative error of the picture")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
     pyplot.close(figure)

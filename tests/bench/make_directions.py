@@ -21,7 +21,8 @@ import jax
 import numpy as np
 from scipy.special import sph_harm_y
 
-from shisd import decomposition, io
+from shisd import decomposition
+from shisd.io.internal import write_atomically
 
 OUTPUT = Path(decomposition.__file__).parent / "data" / "optimized_directions.npz"
 TOP = 64
@@ -101,7 +102,7 @@ def main() -> None:
             table[rows], conditions[degree], nested[degree] = z, condition, worst_condition(z, degree, nested=True)
         found = {"directions": table, "conditions": conditions, "nested_conditions": nested}
         write = lambda file, found=found: np.savez_compressed(file, **found)
-        io.write_atomically(options.output, write, overwrite=True)
+        write_atomically(options.output, write, overwrite=True)
         jax.clear_caches()
 
 

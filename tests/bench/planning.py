@@ -7,6 +7,7 @@ import numpy as np
 
 from shisd import models, planning, reference, shading
 from shisd.planning._bands import known_light, known_material
+from shisd.planning._paths import Polygon, Table
 from shisd.planning._prediction import judge
 from tests.bench.lobes import load_map
 from tests.bench.timing import interleaved
@@ -93,7 +94,7 @@ def bench_prediction(degrees=(4, 8, 16), count=1024, names=("interior", "studio"
         known = known_material(brdf, reference_degree, 64)
         for name, light in lights.items():
             truth = truth_of(brdf, light, where)
-            path = planning.Polygon if name == "lamp" else planning.Table
+            path = Polygon if name == "lamp" else Table
             for degree in degrees:
                 judged = judge(path, known, seen[name], degree)
                 measured = relative(general(brdf, light, degree)(*where), truth)
