@@ -58,12 +58,9 @@ def prepare_output(folder: Path, overwrite: bool, name: str, parser: argparse.Ar
 def save(path: Path, content: str | Callable[[IO[bytes]], object]) -> None:
     """Put a text, or what a function writes to a binary file, in the place of what is there, whole or not at all."""
     beside = path.with_name(f".{path.name}.part")
-    try:
-        with beside.open("wb") as file:
-            file.write(content.encode()) if isinstance(content, str) else content(file)
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with beside.open("wb") as file:
+        file.write(content.encode()) if isinstance(content, str) else content(file)
+    beside.replace(path)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@
 
 import jax.typing
 from jaxtyping import Array as Array
+from jaxtyping import Bool as Bool
 from jaxtyping import Float as Float
 from typing_extensions import TypeAliasType
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import filtering, models
+from shisd.filtering._merl import _bin_energy
 from shisd.io._merl import tabulate_merl
 from shisd.io.internal import merl_above_horizon, merl_directions
 from shisd.models._measured import fill_nearest
@@ -55,11 +56,11 @@ def rms(error: np.ndarray) -> float:
 
 def fit_bins(noisy: np.ndarray, degree: int) -> filtering.BrdfFit:
     """ISD15's projection of bins drawn with the share of the energy that they stand for."""
-    energy = np.where(np.all(noisy >= 0, axis=-1), filtering._bin_energy(), 0).ravel()
+    energy = np.where(np.all(noisy >= 0, axis=-1), _bin_energy(), 0).ravel()
     wi, wo = (w.reshape(-1, 3) for w in merl_directions())
     some = np.random.default_rng(2).choice(energy.size, SAMPLES, p=energy / energy.sum())
     values = noisy.reshape(-1, 3)[some].astype(np.float32)
-    return filtering.fit_brdf(wi[some], wo[some], values, degree, isotropic=True, ridge=1e-7)
+    return filtering.fit_brdf(wi[some], wo[some], values, degree, isotropic=True, ridge=1e-7, throw=False)
 
 
 def at_bins(brdf: models.AbstractBrdf) -> np.ndarray:
