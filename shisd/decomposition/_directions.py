@@ -18,13 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._progress import Progress, reporting
 from shisd._status import Status, settled
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.harmonics import legendre
 
 TABLE_DEGREE = 64

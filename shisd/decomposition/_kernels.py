@@ -22,11 +22,10 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._module import Module
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.harmonics import legendre, zonal_basis
 from shisd.harmonics.internal import gauss_rows, legendre_of_versine, zonal_norms
 

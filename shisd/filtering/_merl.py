@@ -17,11 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import cg
-from jax.typing import DTypeLike
 
 from shisd import _checks, io
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, ArrayLike, DTypeLike, Float
 from shisd.io.internal import MERL_BINS, merl_above_horizon, merl_directions
 from shisd.models import MeasuredBrdf
 from shisd.models.internal import fill_nearest

@@ -8,11 +8,10 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks, harmonics, io
 from shisd._module import Module
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, ArrayLike, DTypeLike, Float
 from shisd.harmonics.internal import sample_map
 from shisd.models.lights._distant import DistantLight
 

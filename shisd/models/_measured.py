@@ -13,11 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import io
 from shisd._numerics import safe_sqrt
-from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar, Vector
 from shisd.io.internal import merl_above_horizon
 from shisd.models._brdf import AbstractBrdf, above_horizon, parameter
 

@@ -20,13 +20,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import angle_multiples, safe_sqrt
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, DTypeLike, Float, Scalar
 from shisd.harmonics import sh_basis
 from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis, of_order
 from shisd.models import AbstractBrdf

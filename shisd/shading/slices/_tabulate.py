@@ -16,12 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import safe_sqrt
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics.internal import orders, weighted_sums
 from shisd.models import AbstractBrdf
