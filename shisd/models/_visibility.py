@@ -26,13 +26,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import _checks, io
+from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress, reporting
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.domains.internal import cap_coefficients
 from shisd.harmonics.internal import bands, orders, rotate_many, weighted_sums
+from shisd.io.internal import optional, ordinary, read_npz, write_atomically
 
 _RAYS_AT_ONCE = 1 << 20
 
@@ -159,21 +160,21 @@ class Visibility(Module):
         return cls(c, corners if points is None else corners[:0], noise)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write all fields as an .npz file, which is there completely or not at all (`shisd.io.write_atomically`).
+        """Write all fields as an .npz file, which is there completely or not at all.
 
         Errors: FileExistsError unless `overwrite=True`; ValueError for another suffix than .npz.
         """
         write = lambda file: np.savez_compressed(
             file, coefficients=self.coefficients, triangles=self.triangles, noise=self.noise
         )
-        io.write_atomically(_npz(path), write, overwrite=overwrite)
+        write_atomically(_npz(path), write, overwrite=overwrite)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Visibility":
         """What `save` wrote. FileNotFoundError, or ValueError for a file that holds something else."""
-        path = io.ordinary(_npz(path))
+        path = ordinary(_npz(path))
         try:
-            return cls(*io.read_npz(path, ("coefficients", "triangles", "noise")))
+            return cls(*read_npz(path, ("coefficients", "triangles", "noise")))
         except Exception as error:
             raise ValueError(f"{path}: not a file that Visibility.save wrote: {error}") from error
 
@@ -271,8 +272,8 @@ def _points(name: str, value: ArrayLike) -> np.ndarray:
 
 def _scene(points: np.ndarray, corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Whether rays from starts [N, 3] along directions [N, 3] hit a triangle; in float32, without gaps at edges."""
-    scenes = io.optional("embreex.rtcore_scene", "the package embreex", "mesh")
-    meshes = io.optional("embreex.mesh_construction", "the package embreex", "mesh")
+    scenes = optional("embreex.rtcore_scene", "the package embreex", "mesh")
+    meshes = optional("embreex.mesh_construction", "the package embreex", "mesh")
     scene = scenes.EmbreeScene(robust=True)
     meshes.TriangleMesh(scene=scene, vertices=points.astype(np.float32), indices=corners.astype(np.int32))
     return lambda starts, directions: scene.run(starts.astype(np.float32), directions.astype(np.float32)) != -1

@@ -293,4 +293,4 @@ def test_errors_name_the_argument(as_user, rng):
 def test_coarse_quadrature_is_refused():
     with pytest.raises(Exception, match="quadrature does not resolve this material"):
         tabulate(models.Ggx(0.05), quadrature=8)
-    assert tabulate(models.Ggx(0.05), quadrature=8, throw=False).quadrature_error > 1e-3
+    assert tabulate(models.Ggx(0.05), quadrature=8, throw=False).error > 1e-3

@@ -22,14 +22,14 @@ class Slices(Module):
 
     Arguments: `coefficients` [*colour, V, (L+1)^2] for isotropic materials, in views at elevations (j + 1/2) (pi/2)/V
     from the normal and azimuth 0 (the slice of azimuth phi is this one turned by phi); [*colour, V, A, (L+1)^2] for
-    anisotropic ones (static `isotropic` False), with azimuths 2 pi i/A. `quadrature_error`: that of the slices,
+    anisotropic ones (static `isotropic` False), with azimuths 2 pi i/A. `error`: that of the quadrature of the slices,
     estimated, relative to their RMS over the picture of a sphere (see `tabulate_brdf`). Static `domain`: where the
     slices stand for the material, everywhere ("sphere") or only above the horizon ("upper").
     As rotated zonal harmonics: `weights` and `from_weights`.
     """
 
     coefficients: Float[Array, "*colour_views n"]
-    quadrature_error: Scalar
+    error: Scalar
     isotropic: bool = eqx.field(static=True)
     domain: Literal["sphere", "upper"] = eqx.field(static=True)
 
@@ -37,7 +37,7 @@ class Slices(Module):
         self,
         coefficients: ArrayLike,
         *,
-        quadrature_error: ArrayLike = 0.0,
+        error: ArrayLike = 0.0,
         isotropic: bool = True,
         domain: Literal["sphere", "upper"] = "sphere",
     ):
@@ -48,7 +48,7 @@ class Slices(Module):
             raise ValueError(f"`coefficients` must have shape [{form}, n] or [colour, {form}, n]; got {list(c.shape)}.")
         check_domain(domain)
         self.coefficients, self.isotropic, self.domain = c, bool(isotropic), domain
-        self.quadrature_error = jnp.asarray(quadrature_error, c.dtype)
+        self.error = jnp.asarray(error, c.dtype)
 
     @property
     def degree(self) -> int:
@@ -85,7 +85,7 @@ class Slices(Module):
         return self._with(fit_above(self.coefficients, ridge), "upper")
 
     def _with(self, coefficients: Array, domain: Literal["sphere", "upper"]) -> "Slices":
-        return Slices(coefficients, quadrature_error=self.quadrature_error, isotropic=self.isotropic, domain=domain)
+        return Slices(coefficients, error=self.error, isotropic=self.isotropic, domain=domain)
 
     @method
     def weights(self, basis: RotatedZonalBasis) -> Float[Array, "*colour_views l k"]:
@@ -103,7 +103,7 @@ class Slices(Module):
         basis: RotatedZonalBasis,
         weights: ArrayLike,
         *,
-        quadrature_error: ArrayLike = 0.0,
+        error: ArrayLike = 0.0,
         isotropic: bool = True,
         domain: Literal["sphere", "upper"] = "sphere",
     ) -> "Slices":
@@ -114,7 +114,7 @@ class Slices(Module):
         if not isinstance(basis, RotatedZonalBasis):
             raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis; got {type(basis).__name__}.")
         c = basis.coefficients(weights)
-        return cls(c, quadrature_error=quadrature_error, isotropic=isotropic, domain=domain)
+        return cls(c, error=error, isotropic=isotropic, domain=domain)
 
 
 def check_domain(domain: object) -> None:
