@@ -7,7 +7,7 @@ mirror image of what is seen from outside, and there regions are positive when c
 and their product is right on either side. `outline` turns the points round instead.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
 
@@ -18,6 +18,7 @@ from shisd.domains import SphericalPolygon, polygon_from_points
 from shisd.domains.internal import Loop
 
 
+@runtime_checkable
 class Flat(Protocol):
     """A polygon in space that lights one side, or both."""
 
