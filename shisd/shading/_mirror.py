@@ -10,6 +10,7 @@ notation: r = mirror direction; tau = trace of C; e = light coefficients.
 """
 
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -236,22 +237,27 @@ def _gaussian(
     xx: Float[Array, " p"], xy: Float[Array, " p"], yy: Float[Array, " p"], degree: int
 ) -> tuple[Float[Array, "rows p"], Float[Array, "rows p"]]:
     """Coefficients of Gaussians of these covariances about the pole, as `harmonics._pairing` orders them."""
-    cos, sin, half, to_orders, plus, minus = _gaussian_tables(degree)
-    cos, sin, half = (jnp.asarray(a, xx.dtype) for a in (cos, sin, half))
+    tables = _gaussian_tables(degree)
+    cos, sin, half = (jnp.asarray(a, xx.dtype) for a in (tables.cos, tables.sin, tables.half_eigenvalues))
     spread = cos**2 @ xx[None] + sin**2 @ yy[None] + 2 * cos * sin @ xy[None]  # k.C k [directions, p]
     kept = jnp.exp(-half * spread[None])
-    c = jnp.einsum("lad,ldp->lap", jnp.asarray(to_orders, xx.dtype), kept).reshape(-1, len(xx))
+    c = jnp.einsum("lad,ldp->lap", jnp.asarray(tables.to_orders, xx.dtype), kept).reshape(-1, len(xx))
     c = jnp.pad(c, ((0, 1), (0, 0)))
-    return c[plus], c[minus]
+    return c[tables.plus], c[tables.minus]
+
+
+class _GaussianTables(NamedTuple):
+    cos: np.ndarray  # [d, 1] of directions k
+    sin: np.ndarray
+    half_eigenvalues: np.ndarray  # [l, 1, 1], l (l+1) / 2
+    to_orders: np.ndarray  # [l, a, d], from values over k to orders 0, 2, 4 ... of cosines, then of sines
+    plus: np.ndarray  # where `_pairing` takes its rows from, m >= 0
+    minus: np.ndarray
 
 
 @functools.cache
-def _gaussian_tables(degree: int) -> tuple[np.ndarray, ...]:
-    """Directions k as cosines and sines [d, 1]; l (l+1) / 2 [l, 1, 1]; the map [l, a, d] from values over k to orders
-    0, 2, 4 ... of cosines, then of sines; and where `_pairing` takes them from.
-
-    sqrt((l+m)! / (l-m)!) / (l (l+1))^(m/2) is the root of the product of 1 - i (i-1) / (l (l+1)) over i = 1 ... m.
-    """
+def _gaussian_tables(degree: int) -> _GaussianTables:
+    # sqrt((l+m)! / (l-m)!) / (l (l+1))^(m/2) is the root of the product of 1 - i (i-1) / (l (l+1)) over i = 1 ... m
     count, even = degree + 4, np.arange(0, degree + 1, 2)  # the series over k, even, to aliases beyond the degree
     angle = np.pi * np.arange(count) / count
     half = _half_eigenvalues(degree)
@@ -270,8 +276,11 @@ def _gaussian_tables(degree: int) -> tuple[np.ndarray, ...]:
         there = (index < (degree + 1) ** 2) & (k % 2 == 0)
         return np.where(there, l * 2 * len(even) + first + k // 2, to_orders.shape[0] * to_orders.shape[1])
 
-    index = places(plus, 0).astype(np.int32), places(minus, len(even)).astype(np.int32)
-    return np.cos(angle)[:, None], np.sin(angle)[:, None], half[:, None, None], to_orders, *index
+    index = [places(plus, 0), places(minus, len(even))]
+    return _GaussianTables(
+        np.cos(angle)[:, None], np.sin(angle)[:, None], half[:, None, None], to_orders,
+        *(where.astype(np.int32) for where in index),
+    )  # fmt: skip
 
 
 # ---- light as maps

@@ -153,9 +153,17 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> Prefiltered:
     table = lambda x: jnp.asarray(pad(x), float)
     highest, none = min(-(-int(m.max()) // 4) * 4, degree), jnp.zeros((0, 0))
     return Prefiltered(
-        none, none, jnp.asarray(pad(order), jnp.int32), table(reduce), table(expand),
-        jnp.asarray(mirror), jnp.asarray(len(m), jnp.int32), jnp.zeros(()), highest, ((), ()),
-    )  # fmt: skip
+        profiles=none,
+        maps=none,
+        order=jnp.asarray(pad(order), jnp.int32),
+        reduce=table(reduce),
+        expand=table(expand),
+        mirror=jnp.asarray(mirror),
+        channels=jnp.asarray(len(m), jnp.int32),
+        error=jnp.zeros(()),
+        highest=highest,
+        colours=((), ()),
+    )
 
 
 def _channels(
