@@ -33,7 +33,7 @@ from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition.internal import gaussian_zonal
 from shisd.harmonics import sh_basis
-from shisd.harmonics.internal import bands, zonal_norms
+from shisd.harmonics.internal import bands, of_order, zonal_norms
 from shisd.models import MeasuredBrdf, ProjectedBrdf
 from shisd.models.internal import fill_nearest, symmetric
 
@@ -194,8 +194,8 @@ def _pairs(
         return sums(c, y_i, y_o)
     total = jnp.zeros((len(y_i), len(c)), c.dtype)
     for m in range(c.shape[-1]):  # at azimuth 0 of wi, harmonics of negative order vanish
-        l = np.arange(m, c.shape[-1])
-        total += sums(c[:, m, m:, m:], y_i[:, l * l + l + m], y_o[:, l * l + l + m])
+        own = of_order(c.shape[-1] - 1, m)
+        total += sums(c[:, m, m:, m:], y_i[:, own], y_o[:, own])
     return total
 
 

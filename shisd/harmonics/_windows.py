@@ -21,7 +21,7 @@ from shisd import _checks
 from shisd._numerics import normalize
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.harmonics import _quadrature, _sh, _tables, _transform
+from shisd.harmonics import _layout, _quadrature, _sh, _tables, _transform
 
 _CANDIDATES, _STEPS = 8, 6  # local minima of the grid that are refined, and Newton steps from each
 _RUNGS = 48  # strengths that are tried before the bisection
@@ -81,7 +81,7 @@ def apply_window(coefficients: ArrayLike, window: ArrayLike) -> Float[Array, "*b
             f"{list(window.shape)}."
         )
     dtype = jnp.promote_types(c.dtype, window.dtype)
-    return c.astype(dtype) * jnp.broadcast_to(window.astype(dtype)[_tables.bands(degree).astype(np.int32)], c.shape)
+    return c.astype(dtype) * jnp.broadcast_to(window.astype(dtype)[_layout.bands(degree).astype(np.int32)], c.shape)
 
 
 class WindowStatus(eqx.Enumeration):
@@ -133,7 +133,7 @@ def _dering_each(batch: dict[str, Array], floor: Scalar, degree: int) -> tuple[A
 
 
 def _dering(c: Float[Array, " n"], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:
-    curvature = jnp.asarray(_curvature(degree)[_tables.bands(degree)], c.dtype)
+    curvature = jnp.asarray(_curvature(degree)[_layout.bands(degree)], c.dtype)
 
     def windowed(c, log_strength):
         return c / (1 + jnp.exp(log_strength) * curvature)

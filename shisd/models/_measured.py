@@ -16,6 +16,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from shisd import io
+from shisd._numerics import safe_sqrt
 from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
 from shisd.models._brdf import AbstractBrdf, above_horizon, parameter
 
@@ -148,8 +149,7 @@ def half_difference_angles(wi: Vector, wo: Vector) -> tuple[Scalar, Scalar, Scal
 
 
 def _length(vector: Array) -> Scalar:
-    square = jnp.sum(vector * vector)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    return safe_sqrt(jnp.sum(vector * vector))
 
 
 def _cell(position: Scalar, count: int) -> tuple[Array, Scalar]:

@@ -28,7 +28,7 @@ from shisd._module import Module
 from shisd._numerics import angle_multiples, safe_sqrt
 from shisd._typing import Array, Float, Scalar
 from shisd.harmonics import sh_basis
-from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis
+from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis, of_order
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 from shisd.shading.slices._slices import Slices, check_domain, products_in_order
@@ -151,12 +151,6 @@ def _project(
 def _azimuths(degree: int, view_degree: int) -> int:
     """Of the views of anisotropic materials: a slice's order m goes round m times with the view."""
     return max(32, 2 * max(degree, view_degree) + 4)
-
-
-def of_order(degree: int, m: int) -> np.ndarray:
-    """Where the coefficients of order m are, l = |m| ... degree."""
-    l = np.arange(abs(m), degree + 1)
-    return l * l + l + m
 
 
 def _directions(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:

@@ -30,6 +30,7 @@ from shisd.harmonics.internal import (
     basis_at,
     gradient_gather,
     pair_many,
+    place,
     rows,
     series_table,
     turned_series,
@@ -211,7 +212,7 @@ def _by_parity(e: Float[Array, "f n"], degree: int) -> Float[Array, "2 2 h a i"]
     n, none = degree // 2 + 1, (degree + 1) ** 2
     m, l = np.mgrid[: 2 * n, : 2 * n]
     inside = (m <= l) & (l <= degree)
-    plus, minus = np.where(inside, l * l + l + m, none), np.where(inside & (m > 0), l * l + l - m, none)
+    plus, minus = np.where(inside, place(l, m), none), np.where(inside & (m > 0), place(l, -m), none)
     norm = jnp.asarray(np.where(m > 0, np.sqrt(2), 1)[None, None], e.dtype)
     both = jnp.pad(e, ((0, 0), (0, 1)))[:, np.stack([plus, minus]).astype(np.int32)] * norm  # f, sign, m, l
     both = both.reshape(-1, 2, n, 2, n, 2).transpose(5, 3, 2, 1, 0, 4)

@@ -8,7 +8,7 @@ import numpy as np
 
 from shisd import _checks
 from shisd._typing import Array, Float
-from shisd.harmonics.internal import bands
+from shisd.harmonics.internal import bands, of_order
 from shisd.shading import _views
 from shisd.shading.slices._upper import RIDGE, hemisphere_blocks
 
@@ -37,7 +37,6 @@ def _successive(degree: int) -> np.ndarray:
     """Transposed, from coefficients to those by functions orthonormal above the horizon, made of y_l^m by rising l."""
     table, blocks = np.zeros(((degree + 1) ** 2,) * 2), hemisphere_blocks(degree)
     for m in range(-degree, degree + 1):
-        l = np.arange(abs(m), degree + 1)
-        index = l * l + l + m
+        index = of_order(degree, m)
         table[np.ix_(index, index)] = np.linalg.cholesky(blocks[abs(m)] + RIDGE * np.eye(len(index)))
     return table

@@ -13,7 +13,7 @@ from shisd._methods import method
 from shisd._module import Module
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics.internal import bands, orders, rows
+from shisd.harmonics.internal import bands, orders, place, rows
 from shisd.shading import _views
 from shisd.shading.slices import _energies
 from shisd.shading.slices._upper import RIDGE, fit_above
@@ -191,7 +191,7 @@ def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p
     cos, sin = _views.azimuth_factors(view, degree + 1)
     sin = sin[np.abs(m)] * jnp.asarray(-np.sign(m)[:, None], c.dtype)
     cos, sin = (jnp.broadcast_to(f, c.shape) for f in (cos[np.abs(m)], sin))
-    return cos * c + sin * c[..., l * l + l - m, :]
+    return cos * c + sin * c[..., place(l, -m), :]
 
 
 def slice_orders(slices: Slices, degree: int) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:
