@@ -33,7 +33,7 @@ WITHOUT = {
     "filtering.*.*": "no method",
     "harmonics.sphere_rule": "takes no array",
     "decomposition.*_directions": "takes no array",
-    "shading.material_degree": "chooses on the host, from values",
+    "shading.Slices.needed_degree": "chooses on the host, from values",
     "*.size": "a number known while tracing",
     "*.degree": "a number known while tracing",
     "*.colour": "a shape",
@@ -448,7 +448,7 @@ CASES = [
         lambda n, x, e: shading.footprint(n, x, e, np.ones((2, 2), bool)),
         lambda: (NORMALS.reshape(2, 2, 3), POSITIONS.reshape(2, 2, 3), PANEL[0]),
     ),
-    Case("shading.band_energies", shading.band_energies, lambda: (slices(),), idle=("error",)),
+    Case("shading.Slices.energies", lambda s: s.energies(), lambda: (slices(),), idle=("error",)),
     Case(
         "shading.tabulate_brdf",
         lambda f: shading.tabulate_brdf(f, 2, elevations=4, quadrature=48, throw=False),

@@ -18,7 +18,7 @@ ALPHA = 0.1
 
 
 def tabulate(alpha=ALPHA, **options):
-    options = {"views": VIEWS, "quadrature": NODES, "throw": False} | options
+    options = {"elevations": VIEWS, "quadrature": NODES, "throw": False} | options
     return shading.tabulate_brdf(models.Ggx(np.asarray(alpha, np.float32)), DEGREE, **options)
 
 

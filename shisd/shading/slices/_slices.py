@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,6 +15,7 @@ from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics.internal import bands, orders, place, rows
 from shisd.shading import _views
+from shisd.shading.slices import _energies
 from shisd.shading.slices._upper import RIDGE, fit_above
 
 
@@ -86,6 +88,41 @@ class Slices(Module):
 
     def _with(self, coefficients: Array, domain: Literal["sphere", "upper"]) -> "Slices":
         return Slices(coefficients, error=self.error, isotropic=self.isotropic, domain=domain)
+
+    @method
+    def energies(self) -> Float[Array, "*colour_views l"]:
+        """Energies of the bands, in 1/sr: the squared norm that each adds to the lower ones.
+
+        Returns [*colour, V, L+1], or [*colour, V, A, L+1] of anisotropic materials. Of slices fitted above the horizon,
+        norms are those above it, of the best fit of each degree there.
+        Derivatives: in the coefficients.
+        """
+        return _energies.band_energies(self.coefficients, self.domain)
+
+    def needed_degree(self, tolerance: float, *, worst: bool = False) -> int:
+        """The smallest degree whose slices differ from these by at most `tolerance`, relative to their RMS.
+
+        Arguments: static `tolerance`; the RMS is over the views of a sphere's picture, by colour, of which the worst
+        counts; `worst=True` takes the worst view instead. The light is not asked: `planning` does that, and needs less
+        where the light is smooth.
+        The choice is made from values, not under jit. Slices end at their own degree, and what is beyond cannot be
+        seen: where their last two bands are needed for the tolerance (odd ones vanish for a Lambertian), that is an
+        error.
+        """
+        tolerance = _checks.number("tolerance", tolerance, positive=True)
+        try:
+            energies = np.asarray(self.energies(), float)
+        except jax.errors.TracerArrayConversionError as error:
+            raise ValueError("the degree is chosen from values: call needed_degree outside jit and grad.") from error
+        if not np.all(np.isfinite(energies)):
+            raise ValueError("the slices hold NaN or infinity: their degree cannot be chosen.")
+        found = _energies.needed_degree(energies.reshape(-1, *energies.shape[len(self.colour) :]), tolerance, worst)
+        if found > max(self.degree - 2, 0):
+            raise ValueError(
+                f"slices of degree {self.degree} need their last bands for `tolerance` {tolerance}, and may need more: "
+                "make them of a higher degree."
+            )
+        return found
 
     @method
     def weights(self, basis: RotatedZonalBasis) -> Float[Array, "*colour_views l k"]:
