@@ -470,11 +470,11 @@ CASES = [
     ),
     Case(
         "shading.Surface.points",
-        lambda n, o, x, t, b: shading.Surface(
-            n, o, x, t, mask=np.True_, triangles=np.zeros((), np.int32), barycentric=b
-        ).points("normals", "views", "positions", "tangents", "barycentric"),
-        lambda: (NORMALS, VIEWS, POSITIONS, TANGENTS, BARYCENTRIC),
-        (0, 1, 2, 3, 4),
+        lambda n, o, x, t, b, m, i: shading.Surface(n, o, x, t, mask=m, triangles=i, barycentric=b).points(
+            "normals", "views", "positions", "tangents", "triangles", "barycentric"
+        ),
+        lambda: (NORMALS, VIEWS, POSITIONS, TANGENTS, BARYCENTRIC, np.arange(N) != 1, np.arange(N)),
+        (0, 1, 2, 3, 4, 5, 6),
     ),
     Case(
         "shading.shade DistantLight",

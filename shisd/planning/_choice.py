@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from shisd import _checks
 from shisd._module import Module
@@ -195,6 +196,17 @@ def _join(
 
 @eqx.filter_jit
 def _shade(paths: tuple[Path, ...], surface: Surface) -> Float[Array, "*batch_colour"]:
+    surface = _whole(surface)
     values = [path.shade(surface) for path in paths]
     most = max(value.ndim for value in values)
     return functools.reduce(jnp.add, (v.reshape(*v.shape, *(1,) * (most - v.ndim)) for v in values))
+
+
+def _whole(surface: Surface) -> Surface:
+    """With all batch axes in every array, so that what some paths ignore counts for all."""
+    names = ("normals", "views", "positions", "tangents")
+    vectors = {name: a for name in names if (a := getattr(surface, name)) is not None}
+    mask = surface.mask
+    shape = np.broadcast_shapes(*(a.shape[:-1] for a in vectors.values()), () if mask is None else mask.shape)
+    wide = {name: jnp.broadcast_to(a, (*shape, 3)) for name, a in vectors.items()}
+    return Surface(**wide, mask=None if mask is None else jnp.broadcast_to(mask, shape))

@@ -89,7 +89,8 @@ def shade(
         value = path.radiance(form, as_type(group, dtype), own, surface)
         batch = value.shape[: value.ndim - len(colour)]
         parts.append(value.reshape(*batch, *(1,) * (most - len(colour)), *colour))
-    return functools.reduce(jnp.add, parts)
+    shape = np.broadcast_shapes(*(part.shape for part in parts))
+    return functools.reduce(jnp.add, (jnp.broadcast_to(part, shape) for part in parts))
 
 
 def _known(lights: Light | Sequence[Light]) -> list[Light]:
