@@ -1,6 +1,6 @@
 """Few fitted lobes against the linear projection, ISD15 section 7.2: slices, shaded spheres, and what each costs.
 
-projection: the cosine-weighted slices on harmonics of some degree, `shading.shade_environment`.
+projection: the cosine-weighted slices on harmonics of some degree, `shading.shade` with a `DistantLight`.
 Gaussians: J spherical Gaussians for each view elevation, each started from its neighbour's; the maps are filtered
 beforehand with Gaussians of a ladder of sharpness and looked up trilinearly, as Wang et al. 2009 do.
 profiles: J fitted axes for each elevation, each with a free zonal profile; the maps are filtered beforehand with every
@@ -330,7 +330,7 @@ def methods(brdf):
         slices, models.DistantLight(light["coefficients"][:, : (slices.degree + 1) ** 2]), shading.Surface(n, v)
     )
     for degree in DEGREES:
-        slices = shading.Slices(exact.coefficients[..., : (degree + 1) ** 2])
+        slices = exact.cut(degree)
         made[f"projection, degree {degree}"] = slices, seconds, projected_values, shade
     shade = lambda table, light, n, v: shade_gaussians(table, light["pyramid"], n, v)
     for count in (1, 3, 7):

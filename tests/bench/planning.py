@@ -1,7 +1,5 @@
 """What `planning` predicts against what quadrature measures, and what a plan saves."""
 
-import functools
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -75,8 +73,8 @@ def general(brdf, light, degree, views=64):
         material = shading.tabulate_brdf(brdf, degree, elevations=views, domain="upper", throw=False)
         return lambda p, n, v: shading.shade(material, light, shading.Surface(n, v, p))
     material = shading.tabulate_brdf(brdf, degree, elevations=views, throw=False)
-    e = light.coefficients(degree) if isinstance(light, models.Environment) else light
-    return lambda p, n, v: shading.shade(material, models.DistantLight(e), shading.Surface(n, v))
+    distant = light.light(degree) if isinstance(light, models.Environment) else light
+    return lambda p, n, v: shading.shade(material, distant, shading.Surface(n, v))
 
 
 def bench_prediction(degrees=(4, 8, 16), count=1024, names=("interior", "studio")):
@@ -125,14 +123,16 @@ def bench_saving(tolerances=(0.1, 0.05), count=16384, judged=512):
     for tolerance in tolerances:
         made = planning.plan(planning.Scene(materials(), lights, where[0][:: count // 12]), tolerance, throw=False)
         degree = max(entry.degree for entry in made.entries)
-        both = sum(light.coefficients(degree) for light in list(lights.values())[:2])
+        both = models.DistantLight(sum(light.coefficients(degree) for light in list(lights.values())[:2]))
         separate, added = {}, {}
         for name, brdf in materials().items():
             calls = [general(brdf, light, degree) for light in lights.values()]
             separate[name] = lambda *w, calls=calls: sum(call(*w) for call in calls)
             calls = [general(brdf, both, degree), calls[2]]
             added[name] = lambda *w, calls=calls: sum(call(*w) for call in calls)
-        planned = {name: functools.partial(made.shade, name) for name in separate}
+        planned = {
+            name: lambda p, n, v, made=made, name=name: made.shade(name, shading.Surface(n, v, p)) for name in separate
+        }
         ways = {"plan": planned, "one degree": separate, "one degree, added up": added}
         every = {way: lambda *w, each=each: [shade(*w) for shade in each.values()] for way, each in ways.items()}
         times = interleaved(every, *(jnp.asarray(a) for a in where), seconds=5.0)

@@ -187,7 +187,7 @@ def ours(name: str, degree: int, rays) -> Method:
     domain = "sphere" if name == "sphere" else "upper"
     start = time.perf_counter()
     material = shading.tabulate_brdf(models.Ggx(ALPHA), degree, domain=domain)
-    light = room().coefficients(degree) if name == "sphere" else models.PolygonLight(LAMP, EMISSION)
+    light = room().light(degree) if name == "sphere" else models.PolygonLight(LAMP, EMISSION)
     jax.block_until_ready((material, light))
     setup = time.perf_counter() - start
     shade = _shade_sphere if name == "sphere" else _shade_floor
@@ -200,9 +200,7 @@ def _shade_sphere(parameters):
     material, light, rays = parameters
     _, normals, views, hit = meet("sphere", rays)
     normals = jnp.where(hit[:, None], normals, views)
-    return jnp.where(
-        hit[:, None], shading.shade(material, models.DistantLight(light), shading.Surface(normals, views)), 0
-    )
+    return jnp.where(hit[:, None], shading.shade(material, light, shading.Surface(normals, views)), 0)
 
 
 def _shade_floor(parameters):

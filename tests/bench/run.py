@@ -65,14 +65,9 @@ def bench_equation_22(degrees=(4, 8, 16, 30)):
                 "max error / max": float(np.max(np.abs(error)) / np.max(np.abs(truth))),
                 "first call s": times[name].first,
             })  # fmt: skip
-        gradient = jax.jit(
-            jax.grad(
-                lambda n, v, m=material, light=light: jnp.sum(
-                    shading.shade(m, models.DistantLight(light), shading.Surface(n, v))
-                ),
-                (0, 1),
-            )
-        )
+        distant = models.DistantLight(light)
+        shaded = lambda n, v, m=material, light=distant: shading.shade(m, light, shading.Surface(n, v))
+        gradient = jax.jit(jax.grad(lambda n, v, f=shaded: jnp.sum(f(n, v)), (0, 1)))
         forward = candidates["rotated"]
         times = interleaved({"gradient": gradient, "forward": forward}, normals[:count], views[:count])
         rows[-1]["value and gradient / forward"] = times["gradient"].median / times["forward"].median
@@ -92,9 +87,9 @@ def memory_child(degree):
     peak = lambda: int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**20
     normals = unit(rng.normal(size=(1024 * 768, 3))).astype(np.float32)
     material = shading.tabulate_brdf(models.Ggx(0.3), degree)
-    light = rng.normal(size=(3, (degree + 1) ** 2)).astype(np.float32)
+    light = models.DistantLight(rng.normal(size=(3, (degree + 1) ** 2)).astype(np.float32))
     before = peak()
-    jax.block_until_ready(shading.shade(material, models.DistantLight(light), shading.Surface(normals, normals)))
+    jax.block_until_ready(shading.shade(material, light, shading.Surface(normals, normals)))
     print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
 
 
@@ -214,12 +209,12 @@ def bench_ridge(ridges=(1e-2, 1e-4, 1e-6, 1e-8, 1e-10), degree=8, count=64):
             exact = [x.astype(float) for x in (position, normal, view)]
             truth = np.asarray(reference.shade_polygon_quadrature(make(), quad, 1.0, *exact, nodes=48))
         for dtype in (np.float32, np.float64):
-            points = [x.astype(dtype) for x in (position, normal, view)]
             with jax.enable_x64(dtype == np.float64):
+                surface = shading.Surface(*(x.astype(dtype) for x in (normal, view, position)))
                 light = models.PolygonLight(quad.astype(dtype))
                 for row in rows:
                     material = shading.tabulate_brdf(make(), degree, domain="upper", ridge=row["ridge"])
-                    error = np.asarray(shading.shade_polygon(material, light, *points)) - truth
+                    error = np.asarray(shading.shade(material, light, surface)) - truth
                     row[f"{name}, {dtype.__name__}"] = float(np.sqrt(np.mean(error**2) / np.mean(truth**2)))
     return rows
 
