@@ -99,4 +99,4 @@ def test_what_stages_give_is_only_what_they_list():
     for stage in (*STAGES, shisd.io):
         public = {name for name in vars(stage) if name[0] != "_"}
         inner = {path.stem for path in Path(stage.__file__).parent.iterdir()}
-        assert public - inner - set(names_of(stage)) <= {"jaxtyping"}, stage.__name__  # the checks of tests put it there
+        assert public - inner - set(names_of(stage)) <= {"jaxtyping"}, stage.__name__  # put there by checks of tests

@@ -130,7 +130,7 @@ def test_a_prepared_material_has_the_slices_of_tabulate_brdf(kind):
 def test_each_light_takes_its_form_of_the_material(rng):
     material = made("isotropic", 3, local_degree=2)
     lights, surface = lights_of(rng, np.float32), surface_of(rng, np.float32)
-    for name, light in lights.items():
+    for light in lights.values():
         form = material.local if isinstance(light, models.PolygonLight | models.PortalLight) else material.distant
         np.testing.assert_array_equal(shading.shade(material, light, surface), shading.shade(form, light, surface))
     pair = [lights["map"], lights["quad"]]
