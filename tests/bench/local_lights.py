@@ -6,8 +6,9 @@ Scenes, float32, 16,384 points: a floor with slightly varied normals, views to 8
 Families (kernels and their sources: `area_lights`): ours, `shade` with a `PolygonLight` or `PortalLight` and slices
 fitted above the horizon; Gauss points on the light; Monte Carlo by solid angle, by the material, by both, all with
 shifted lattices; linearly transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the
-light by Xu et al.'s rule; the light's harmonics, turned to the local frame; axial moments. Points and samples of a portal look the distant light up in
-a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the slices' degree.
+light by Xu et al.'s rule; the light's harmonics, turned to the local frame; axial moments. Points and samples of a
+portal look the distant light up in a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the
+window at the slices' degree.
 Derivatives are measured in the full run, in one polygon task, as their cost depends on no numbers: of ours, points and
 samples of the light and transformed cosines; for projections of ours and of points. Those of points and samples are of
 the sum as it stands, without what happens where the light crosses the horizon, and by JAX's reverse mode, which XLA
