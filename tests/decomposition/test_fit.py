@@ -317,19 +317,16 @@ def picture_problem(rng, degree=8, views=6):
     normals, seen = unit(rng.normal(size=(2, 200, 3)))
     seen = unit(seen + 1.2 * normals)
     bands = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
-    light = jnp.asarray(rng.normal(size=bands.size) / (1 + bands) ** 1.5 + 3 * (bands == 0))
+    light = models.DistantLight(rng.normal(size=bands.size) / (1 + bands) ** 1.5 + 3 * (bands == 0))
+    surface = lambda part: shading.Surface(normals[part], seen[part])
 
     def picture(parameters, part):
         directions, log_sharpness, weights = parameters
         lobes = jax.vmap(decomposition.GaussianLobes)(directions, jnp.exp(log_sharpness), weights)
         c = jax.vmap(lambda lobes: lobes.coefficients(degree))(lobes)
-        return shading.shade(
-            shading.Slices(c),
-            models.DistantLight(light),
-            shading.Surface(jnp.asarray(normals[part]), jnp.asarray(seen[part])),
-        )
+        return shading.shade(shading.Slices(c), light, surface(part))
 
-    truth = shading.shade(exact, models.DistantLight(light), shading.Surface(jnp.asarray(normals), jnp.asarray(seen)))
+    truth = shading.shade(exact, light, surface(slice(None)))
 
     def loss(parameters, part):
         return jnp.mean((picture(parameters, part) - truth[part]) ** 2) / jnp.mean(truth[part] ** 2)
