@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from shisd._typing import Array, Float
 from shisd.models import DistantLight, Environment, Occluded, PolygonLight, PortalLight, SphereLight, ZonalLight
@@ -17,7 +18,7 @@ from shisd.shading.paths import _distant, _occluded, _polygon, _sphere, _zonal
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices
 
-Light = DistantLight | ZonalLight | Occluded | PolygonLight | PortalLight | SphereLight
+Light = TypeAliasType("Light", DistantLight | ZonalLight | Occluded | PolygonLight | PortalLight | SphereLight)
 PATHS: dict[type, Path] = {
     DistantLight: _distant.PATH,
     ZonalLight: _zonal.PATH,
