@@ -3,7 +3,12 @@
 from tests.mutants import Mutant
 
 POLYGON, SURFACE = "tests/shading/test_polygon.py::", "tests/shading/test_surface.py::"
-MIRROR = "tests/shading/test_mirror.py::"
+MIRROR, SHADE = "tests/shading/test_mirror.py::", "tests/shading/test_shade.py::"
+LIGHTS = "tests/models/test_lights.py::"
+OUTLINE, DISTANT = "shisd/models/lights/_outline.py", "shisd/models/lights/_distant.py"
+SLICES = "shisd/shading/slices/_slices.py"
+SIDES = LIGHTS + "test_outlines_are_positive_where_they_are_lit_and_nothing_behind"
+MIXED = SHADE + "test_lights_of_mixed_kinds_add_up[colour0-float32]"
 SLICE = POLYGON + "test_values_and_gradients_of_the_slice[float32]"
 
 MUTANTS = [
@@ -40,12 +45,12 @@ MUTANTS = [
         old="whole, lambda: clip(outline, above))", new="whole, whole)", test=SLICE,
     ),
     Mutant(
-        "a light's plane from absolute coordinates", "shisd/models/lights/_outline.py",
+        "a light's plane from absolute coordinates", OUTLINE,
         old="edges = light.points - light.points[:1]", new="edges = light.points",
         test=POLYGON + "test_far_from_the_origin[4e+06]",
     ),
     Mutant(
-        "lights are seen from behind", "shisd/models/lights/_outline.py",
+        "lights are seen from behind", OUTLINE,
         old="jnp.minimum(side, 0)", new="jnp.maximum(side, 0)", test=POLYGON + "test_several_lights",
     ),
     Mutant(
@@ -121,5 +126,80 @@ MUTANTS = [
         old="angle = loop_solid_angle(v, 2 * np.pi, towards(light, relative))",
         new="angle = loop_solid_angle(v, 2 * np.pi)",
         test="tests/shading/test_polygon.py::test_projected_light_close_to_a_lamp",
+    ),
+    Mutant(
+        "lights of two sides have one", OUTLINE,
+        old="return side if light.two_sided else jnp.minimum(side, 0)", new="return jnp.minimum(side, 0)",
+        test=SIDES + "[float32-two-sided-square]",
+    ),
+    Mutant(
+        "the other side of a light takes light away", OUTLINE,
+        old="return side if light.two_sided", new="return -jnp.abs(side) if light.two_sided",
+        test=LIGHTS + "test_a_white_surface_is_lit_exactly_where_the_outline_is_above_its_horizon[two-sided]",
+    ),
+    Mutant(
+        "outlines run the way that they do seen from outside", OUTLINE,
+        old="jnp.where(side < 0, points[::-1],", new="jnp.where(side < 0, points,",
+        test=SIDES + "[float32-one-sided-square]",
+    ),
+    Mutant(
+        "outlines from the other side run the wrong way", OUTLINE,
+        old="jnp.where(side > 0, points, dark)", new="jnp.where(side > 0, points[::-1], dark)",
+        test=SIDES + "[float32-two-sided-square]",
+    ),
+    Mutant(
+        "outlines are seen from dark sides", OUTLINE,
+        old="jnp.where(side > 0, points, dark)", new="points", test=SIDES + "[float32-portal-square]",
+    ),
+    Mutant(
+        "only the first kind of light", "shisd/shading/_shade.py",
+        old="functools.reduce(jnp.add, (jnp.broadcast_to(part, shape) for part in parts))",
+        new="jnp.broadcast_to(parts[0], shape)", test=MIXED,
+    ),
+    Mutant(
+        "only the first distant light", "shisd/shading/paths/_distant.py",
+        old="return functools.reduce(jnp.add, parts)", new="return parts[0]", test=MIXED,
+    ),
+    Mutant(
+        "only the first light that is hidden in part", "shisd/shading/paths/_occluded.py",
+        old="return functools.reduce(jnp.add, parts)", new="return parts[0]", test=MIXED,
+    ),
+    Mutant(
+        "distant lights up to the lowest of their degrees", "shisd/shading/paths/_distant.py",
+        old="min(degree, max(light.degree", new="min(degree, min(light.degree", test=MIXED,
+    ),
+    Mutant(
+        "distant lights of few bands put among high ones", "shisd/shading/paths/_distant.py",
+        old="(0, size - c.shape[-1])]", new="(size - c.shape[-1], 0)]", test=MIXED,
+    ),
+    Mutant(
+        "norms of zonal light as distant light", DISTANT,
+        old="jnp.asarray(1 / zonal_norms(self.degree),", new="jnp.asarray(zonal_norms(self.degree),",
+        test=LIGHTS + "test_a_zonal_light_is_a_sum_of_legendre_polynomials[float32-colour0]",
+    ),
+    Mutant(
+        "distant light turned back", DISTANT,
+        old="rotate(self.coefficients, rotation)", new="rotate(self.coefficients, jnp.asarray(rotation).T)",
+        test=LIGHTS + "test_a_turned_light_comes_from_turned_directions[float32-colour0]",
+    ),
+    Mutant(
+        "surfaces without their mask", "shisd/shading/_surface.py",
+        old="for name in names} | masks(self.mask)", new="for name in names}", test=SURFACE + "test_masks[environment]",
+    ),
+    Mutant(
+        "slices that are cut keep their bands", SLICES,
+        old='self._with(self.coefficients[..., : (degree + 1) ** 2], "sphere")',
+        new='self._with(self.coefficients, "sphere")',
+        test=SHADE + "test_a_prepared_material_has_the_slices_of_tabulate_brdf[isotropic]",
+    ),
+    Mutant(
+        "slices for local light of the wrong degree", "shisd/shading/_material.py",
+        old="slices.cut(local_degree).above_horizon()", new="slices.cut(degree).above_horizon()",
+        test=SHADE + "test_a_prepared_material_has_the_slices_of_tabulate_brdf[isotropic]",
+    ),
+    Mutant(
+        "slices above the horizon are not fitted", SLICES,
+        old='self._with(fit_above(self.coefficients, ridge), "upper")', new='self._with(self.coefficients, "upper")',
+        test="tests/test_planning.py::test_the_tolerance_is_met_against_quadrature[clay-lamp]",
     ),
 ]  # fmt: skip
