@@ -50,7 +50,7 @@ def outline(light: Flat, origin: ArrayLike) -> SphericalPolygon:
     dtype = jnp.promote_types(o.dtype, light.points.dtype)
     points, o = light.points.astype(dtype), o.astype(dtype)
     side = facing(light, (points - o[None]).T[..., None])
-    dark = jnp.broadcast_to(points[:1] + 0 * side, points.shape)  # NaN where one of the points is
+    dark = jnp.where(side == 0, jnp.broadcast_to(points[:1], points.shape), jnp.nan)
     return polygon_from_points(jnp.where(side < 0, points[::-1], jnp.where(side > 0, points, dark)), o)
 
 
