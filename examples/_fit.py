@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from tqdm import tqdm
 
-from shisd import io, models, plotting
+from shisd import io, models
 
 # Pixels whose surface is seen at a flatter angle are left out: over these, four rays no longer make the mean.
 LEAST_FACING = 0.25
@@ -84,10 +83,8 @@ def load(path: Path, size: int | None = None) -> Picture:
     inner, outer = ([*itertools.product((-a, a), repeat=2)] for a in (gauss, 0.5))
     for shift in [*inner, *outer]:
         rays = _scene.camera_rays(len(image), *camera, shift)
-        along = -rays @ eye
-        inside = along**2 - eye @ eye + 1
-        point = eye + (along - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
-        used &= (inside > 0) & (np.sum(-rays * point, axis=-1) > LEAST_FACING)
+        inside, point = _scene.sphere_hits(eye, rays)
+        used &= inside & (np.sum(-rays * point, axis=-1) > LEAST_FACING)
         if shift in inner:
             points.append(point)
             views.append(-rays)
@@ -124,18 +121,15 @@ class LeastSquares:
             self.initial = self.solver.init(self.residuals, y, data, {}, shape, None, frozenset())
         state = eqx.tree_at(lambda s: s.y_eval, self.initial, y)
         losses, path, converged = [], [], False
-        with tqdm(total=steps, desc=label) as bar:
-            for _ in range(steps):
-                y, state, _ = self.step(self.residuals, y, data, {}, state, frozenset())
-                losses.append(float(jnp.mean(state.f_info.residual**2)))
-                path.append(np.asarray(y, float))
-                bar.set_postfix_str(f"loss {losses[-1]:.3g}")
-                bar.update()
-                # Near the optimum rounding decides whether the next step is accepted: one too small to matter ends it.
-                ahead = np.asarray(state.y_eval, float) - path[-1]
-                converged = np.all(np.abs(ahead) < self.solver.atol + self.solver.rtol * np.abs(path[-1]))
-                if converged:
-                    break
+        for _ in _scene.progress(range(steps), label):
+            y, state, _ = self.step(self.residuals, y, data, {}, state, frozenset())
+            losses.append(float(jnp.mean(state.f_info.residual**2)))
+            path.append(np.asarray(y, float))
+            # Near the optimum rounding decides whether the next step is accepted: one too small to matter ends it.
+            ahead = np.asarray(state.y_eval, float) - path[-1]
+            converged = np.all(np.abs(ahead) < self.solver.atol + self.solver.rtol * np.abs(path[-1]))
+            if converged:
+                break
         if not converged:
             print(f"{label}: {steps} steps were not enough; the best so far is kept. Try more --steps.")
         return Fit(path[-1], np.array(losses), np.array(path), bool(converged))
@@ -188,35 +182,27 @@ def sheet(
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    ink, paper = "#e8e6e3", "#17181b"
-    error = np.linalg.norm(fitted - picture.values, axis=1) / np.linalg.norm(picture.values, axis=1).mean()
-    error = np.where(picture.used, picture.show(np.repeat(error[:, None], 3, axis=1))[..., 0], np.nan)
-    false = np.where(picture.used[..., None], plotting.false_colour(error, limits=limits), 0)
+    ink, paper = _scene.INK, _scene.PAPER
+    mean = np.linalg.norm(picture.values, axis=1).mean()
+    false = np.nan_to_num(picture.show(_scene.false_colour(fitted - picture.values, mean, limits)))
     target, fit = (io.tonemap(np.nan_to_num(a), exposure=exposure) for a in (picture.image, picture.show(fitted)))
     style = {"text.color": ink, "font.size": 9, "axes.edgecolor": ink, "axes.labelcolor": ink, "axes.facecolor": paper}
     with pyplot.rc_context(style | {"xtick.color": ink, "ytick.color": ink}):
-        figure = pyplot.figure(figsize=(10.6, 2.9), facecolor=paper)
+        figure = pyplot.figure(figsize=(11.6, 2.9), facecolor=paper)
         titles = "picture (Mitsuba 3)", "fit", "difference / mean radiance"
         for k, (image, title) in enumerate(zip((target, fit, false), titles, strict=True)):
-            axes = figure.add_axes((0.01 + 0.225 * k, 0.085, 0.22, 0.82))
+            axes = figure.add_axes((0.009 + 0.206 * k, 0.085, 0.201, 0.82))
             axes.set_axis_off()
             axes.set_title(title)
             axes.imshow(image, interpolation="nearest")
-        scale = figure.add_axes((0.483, 0.075, 0.175, 0.025))
-        ramp = np.geomspace(*limits, 256)[None]
-        ends = np.log10(limits)
-        scale.imshow(plotting.false_colour(ramp, limits=limits), aspect="auto", extent=(*ends, 0, 1))
-        scale.set_yticks([])
-        decades = np.arange(*np.round(ends).astype(int) + [0, 1])
-        scale.set_xticks(decades, [f"{100 * 10.0**d:g} %" for d in decades], fontsize=7)
-        scale.tick_params(length=0, pad=1)
-        axes = figure.add_axes((0.735, 0.17, 0.255, 0.72))
+        _scene.colour_scale(figure, (0.441, 0.075, 0.16, 0.025), limits)
+        axes = figure.add_axes((0.672, 0.17, 0.233, 0.72))
         for (name, values), colour in zip(curves.items(), COLOURS, strict=False):
             axes.semilogy(np.arange(len(values)), values, label=name, color=colour, linewidth=1.3)
         axes.set_title("error % by step")
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(color=ink, alpha=0.15, linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False, fontsize=7.5, loc="lower left", labelcolor=ink)
+        axes.legend(frameon=False, fontsize=7.5, loc="center left", bbox_to_anchor=(1, 0.5), labelcolor=ink)
         _scene.save(path, lambda file: figure.savefig(file, format="png", dpi=120, facecolor=paper))
         pyplot.close(figure)

@@ -16,15 +16,13 @@ from pathlib import Path
 import _scene
 import jax
 import numpy as np
-from relight import gold_metallic_paint, load_map
-from tqdm import tqdm
 
-from shisd import harmonics, io, models, plotting, reference, shading
+from shisd import harmonics, io, models, reference, shading
 
 BOX = np.array([[-3.0, 0.0, 0.0], [3.0, 6.0, 3.0]])
 EYE, TARGET = np.array([0.4, 0.25, 1.55]), np.array([-0.15, 4.0, 0.75])
 DEGREES = {"floor": 20, "walls": 8}
-WORST, BEST = 1e-1, 1e-6  # relative errors at the ends of the false-colour scale
+LIMITS = 1e-6, 1e-1  # relative errors at the ends of the false-colour scale
 
 
 def outline(centre: tuple, normal: tuple, plane: np.ndarray) -> np.ndarray:
@@ -98,35 +96,34 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
     rays = _scene.camera_rays(size, EYE, TARGET, np.radians(72))[size // 6 : -size // 6 or None]
     shape, flat = rays.shape[:2], rays.reshape(-1, 3)
     positions, normals, floor = room(flat)
-    surfaces = {"floor": floor, "walls": ~floor}
-    brdfs = {"floor": gold_metallic_paint(), "walls": models.Lambertian(np.array([0.7, 0.7, 0.68]))}
-    outside = load_map("interior")
+    parts = {"floor": floor, "walls": ~floor}
+    brdfs = {"floor": _scene.gold_metallic_paint(), "walls": models.Lambertian(np.array([0.7, 0.7, 0.68]))}
+    outside = _scene.load_map("interior")
     outside = models.Environment(np.roll(outside.texels, 240, axis=1))  # bright panes towards the window
     coefficients = np.asarray(outside.coefficients(12))
     expansion = lambda w: harmonics.evaluate(coefficients, w[:, None])
 
     slices = {name: shading.tabulate_brdf(brdfs[name], degree, domain="upper") for name, degree in DEGREES.items()}
+    shade = lambda part, light, p, n, v: shading.shade(slices[part], light, shading.Surface(n, v, p))
 
     images, truths, rows = {}, {}, []
     names = [*lights(), "window"]
-    for name in tqdm(names, "lights"):
+    for name in _scene.progress(names, "lights"):
         image, truth = np.zeros((len(flat), 3)), np.zeros((len(flat), 3))
-        for surface, mask in surfaces.items():
+        for part, mask in parts.items():
             points = [a[mask].astype(np.float32) for a in (positions, normals, -flat)]
             if name == "window":
                 corners, emission = window(), expansion
                 light = models.PortalLight(corners.astype(np.float32), coefficients)
-                shade = shading.shade_portal
             else:
                 corners, emission = lights()[name]
                 light = models.PolygonLight(corners.astype(np.float32), emission.astype(np.float32))
-                shade = shading.shade_polygon
-            judge = functools.partial(reference.shade_polygon_quadrature, brdfs[surface], corners)
-            image[mask], seconds = timed(functools.partial(shade, slices[surface], light), *points)
+            judge = functools.partial(reference.shade_polygon_quadrature, brdfs[part], corners)
+            image[mask], seconds = timed(functools.partial(shade, part, light), *points)
             start = time.perf_counter()
             truth[mask] = judge(emission, *points, nodes=nodes)
             reference_seconds = time.perf_counter() - start
-            row = {"light": name, "surface": surface, "degree": DEGREES[surface]}
+            row = {"light": name, "surface": part, "degree": DEGREES[part]}
             row["error"] = relative(image[mask], truth[mask])
             row["us/pixel"], row["reference us/pixel"] = (1e6 * t / mask.sum() for t in (seconds, reference_seconds))
             if name == "window":
@@ -144,11 +141,13 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
     show = lambda values, name: picture(values, {k: v for k, v in emitters.items() if name in (k, "all")}, shape)
     panels = {}
     for name in [*names, "all"]:
-        error = np.linalg.norm(images[name] - truths[name], axis=1) / np.linalg.norm(truths[name], axis=1).mean()
-        false = plotting.false_colour(error, limits=(BEST, WORST)).reshape(*shape, 3)
+        mean = np.linalg.norm(truths[name], axis=1).mean()
+        false = _scene.false_colour(images[name] - truths[name], mean, LIMITS).reshape(*shape, 3)
         panels[name] = show(images[name], name), show(truths[name], name), false
         io.write_image(output / f"{name}.png", np.concatenate(panels[name], axis=1), overwrite=True)
-    sheet(output / "area_lights.png", panels)
+    columns = "exact over the outline", "reference", "difference"
+    lines = [(name, list(images)) for name, images in panels.items()]
+    _scene.sheet(output / "area_lights.png", columns, lines, limits=LIMITS)
     return rows
 
 
@@ -157,36 +156,6 @@ def picture(values: np.ndarray, emitters: dict, shape: tuple[int, int]) -> np.nd
     for covered, emission in emitters.values():
         image[covered] = np.broadcast_to(emission, image.shape)[covered]
     return io.tonemap(image.reshape(*shape, 3), exposure=1.2)
-
-
-def sheet(path: Path, panels: dict) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    ink, paper = "#e8e6e3", "#17181b"
-    with pyplot.rc_context({"text.color": ink, "font.size": 9, "axes.edgecolor": ink}):
-        height = 0.9 + 1.78 * len(panels)
-        figure, grid = pyplot.subplots(len(panels), 3, figsize=(8.2, height), facecolor=paper)
-        figure.subplots_adjust(0.05, 0.45 / height, 0.99, 1 - 0.35 / height, 0.02, 0.02)
-        for axes, title in zip(grid[0], ("exact over the outline", "reference", "difference"), strict=True):
-            axes.set_title(title, color=ink)
-        for row, (name, images) in zip(grid, panels.items(), strict=True):
-            row[0].text(-0.03, 0.5, name, rotation=90, ha="right", va="center", transform=row[0].transAxes)
-            for axes, image in zip(row, images, strict=True):
-                axes.set_axis_off()
-                axes.imshow(image, interpolation="nearest")
-        scale = figure.add_axes((0.68, 0.24 / height, 0.3, 0.1 / height))
-        ends = np.log10([BEST, WORST])
-        ramp = plotting.false_colour(np.geomspace(BEST, WORST, 256)[None], limits=(BEST, WORST))
-        scale.imshow(ramp, aspect="auto", extent=(*ends, 0, 1))
-        scale.set_yticks([])
-        scale.set_xticks([-6, -4, -2], ["1e-6", "1e-4", "1e-2"], color=ink, fontsize=7)
-        scale.tick_params(length=0, pad=1)
-        figure.text(0.665, 0.22 / height, "error / mean radiance", ha="right", fontsize=8)
-        _scene.save(path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper))
-        pyplot.close(figure)
 
 
 def table(rows: list[dict], nodes: int) -> str:
@@ -223,7 +192,9 @@ def main(arguments: list[str] | None = None) -> None:
     _scene.save(options.output / "area_lights.md", text + "\n")
     print(text)
     check(rows)
-    print(f"\n{time.perf_counter() - start:.0f} s, pictures in {options.output}/.")
+    worst = {part: max(r["error"] for r in rows if r["surface"] == part) for part in DEGREES}
+    reached = f"Radiance within {worst['floor']:.1e} of quadrature on the floor and {worst['walls']:.1e} on the walls"
+    _scene.verdict(reached, start, options.output)
 
 
 if __name__ == "__main__":

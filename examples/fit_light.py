@@ -20,11 +20,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from shisd import models, shading
 
-DATA = Path(__file__).resolve().parent / "data"
 LIGHT_DEGREE = 3
 DEGREE = 12  # of the slices over the lamp: with 16, the picture moves by less than its noise
 MISFIT = 0.02  # of the picture's RMS: what worse fits leave is no noise, but the wrong valley
@@ -45,18 +43,16 @@ def chain(picture: _fit.Picture) -> Callable:
     known = {name: jnp.asarray(picture.known[name]) for name in ("alpha", "albedo", "specular", "outline")}
     material = _fit.Coated(known["alpha"], known["albedo"], known["specular"])
     points, views = jnp.asarray(picture.points), jnp.asarray(picture.views)
-    sky_slices = shading.tabulate_brdf(material, LIGHT_DEGREE)
-    lamp_slices = shading.tabulate_brdf(material, DEGREE, domain="upper")
+    ready = shading.prepare(material, LIGHT_DEGREE, local_degree=DEGREE, progress=_scene.PROGRESS)
+    surface = shading.Surface(points, views, points)  # of the unit sphere, whose points are its normals
     harmonics = jnp.eye((LIGHT_DEGREE + 1) ** 2, dtype=points.dtype)
-    sky = shading.shade(sky_slices, models.DistantLight(harmonics), shading.Surface(points, views))
-
+    sky = shading.shade(ready, models.DistantLight(harmonics), surface)
     portal = models.PortalLight(known["outline"], harmonics)
 
     def images(place: jax.Array) -> jax.Array:
         corners = known["outline"] + place
-        lamp = shading.shade(lamp_slices, models.PolygonLight(corners), shading.Surface(points, views, points))
-        moved = eqx.tree_at(lambda p: p.points, portal, corners)
-        hidden = shading.shade(lamp_slices, moved, shading.Surface(points, views, points))
+        lamp = shading.shade(ready, models.PolygonLight(corners), surface)
+        hidden = shading.shade(ready, eqx.tree_at(lambda p: p.points, portal, corners), surface)
         return jnp.concatenate([sky - hidden, lamp[..., None]], axis=-1).mean(axis=1)
 
     return images
@@ -70,7 +66,7 @@ def best_linear(images: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def run(output: Path, size: int | None, steps: int, noisy: int) -> list[_fit.Row]:
-    picture = _fit.load(DATA / "light.npz", size)
+    picture = _fit.load(_scene.DATA / "light.npz", size)
     scale = np.sqrt(np.mean(picture.values**2))
     images = chain(picture)
     residuals = lambda free, values: ((best_linear(images(position(free)), values)[1] - values) / scale).ravel()
@@ -80,7 +76,10 @@ def run(output: Path, size: int | None, steps: int, noisy: int) -> list[_fit.Row
 
     def fit(values: np.ndarray, label: str) -> tuple[_fit.Fit, list[np.ndarray]]:
         """From the one that explains the picture best of places far from the lamp; if that fails, from the next."""
-        losses = [float(np.mean((linear(free_parameters(p), values)[1] - values) ** 2)) for p in tqdm(STARTS, label)]
+        losses = [
+            float(np.mean((linear(free_parameters(p), values)[1] - values) ** 2))
+            for p in _scene.progress(STARTS, label)
+        ]
         fits = []
         for k in np.argsort(losses)[:3]:
             name = f"{label} from {', '.join(f'{x:g}' for x in STARTS[k])}"
@@ -158,7 +157,9 @@ def main(arguments: list[str] | None = None) -> None:
     _scene.save(options.output / "fit_light.md", text + "\n")
     print(text)
     assert rows[0].error < 1, f"the lamp is {rows[0].error:.2g} % of its distance from its place"
-    print(f"\n{time.perf_counter() - start:.0f} s, picture in {options.output}/.")
+    others = max(row.error for row in rows[4:])
+    reached = f"Lamp within {rows[0].error:.2g} % of its distance, its emission and the sky within {others:.2g} %"
+    _scene.verdict(reached, start, options.output)
 
 
 if __name__ == "__main__":

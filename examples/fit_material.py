@@ -22,7 +22,6 @@ import numpy as np
 
 from shisd import models, shading
 
-DATA = Path(__file__).resolve().parent / "data"
 NAMES = "alpha along x", "alpha along y", "albedo, red", "albedo, green", "albedo, blue", "specular"
 START = 0.7, 0.7, 0.2, 0.2, 0.2, 0.1
 COARSE = 8
@@ -40,15 +39,16 @@ def material(logarithms: jax.Array) -> _fit.Coated:
 
 def chain(picture: _fit.Picture, environment: models.Environment, degree: int) -> Callable:
     """The picture [N, 3] of the pixels that are used, as a function of the parameters [6]."""
-    light = environment.coefficients(degree)
+    light = environment.light(degree)
     normals, views = (jnp.asarray(a, jnp.float32) for a in (picture.points, picture.views))
     tangents = jnp.stack([-normals[..., 1], normals[..., 0], jnp.zeros_like(normals[..., 0])], axis=-1)
-    options = {"views": VIEWS, "azimuths": 2 * degree + 4, "quadrature": QUADRATURE}
+    surface = shading.Surface(normals, views, tangents=tangents)
+    options = {"elevations": VIEWS, "azimuths": 2 * degree + 4, "quadrature": QUADRATURE}
 
     def image(parameters: jax.Array) -> jax.Array:
         # The quadrature's own estimate is of the worst slice, next to the horizon, which no pixel shows: not asked for.
         slices = shading.tabulate_brdf(material(parameters), degree, **options, throw=False)
-        return shading.shade(slices, models.DistantLight(light), shading.Surface(normals, views, tangents)).mean(axis=1)
+        return shading.shade(slices, light, surface).mean(axis=1)
 
     return image
 
@@ -71,10 +71,10 @@ def cost(loss: Callable, parameters: jax.Array) -> str:
 
 
 def run(output: Path, size: int | None, degree: int, steps: int, noisy: int) -> tuple[list[_fit.Row], str]:
-    picture = _fit.load(DATA / "material.npz", size)
+    picture = _fit.load(_scene.DATA / "material.npz", size)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of three texels below zero
-        environment = models.Environment.load(DATA / "studio.exr")
+        environment = models.Environment.load(_scene.DATA / "studio.exr")
     scale = np.sqrt(np.mean(picture.values**2))
     images = {d: chain(picture, environment, d) for d in (COARSE, degree)}
     solvers = {}
@@ -134,7 +134,12 @@ def main(arguments: list[str] | None = None) -> None:
     print(text)
     for row in rows:
         assert row.error < 2, f"{row.parameter}: {row.error:.2g} % from the truth"
-    print(f"\n{report}\n{time.perf_counter() - start:.0f} s, picture in {options.output}/.")
+    print(f"\n{report}")
+    worst = max(rows, key=lambda row: row.error)
+    reached = (
+        f"Material within {worst.error:.2g} % of the truth ({worst.parameter}, the worst of {len(rows)} parameters)"
+    )
+    _scene.verdict(reached, start, options.output)
 
 
 if __name__ == "__main__":

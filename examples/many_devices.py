@@ -30,7 +30,6 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from shisd import models, shading
 
-DATA = Path(__file__).resolve().parent / "data"
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 TOLERANCE = {"radiance": 1e-6, "light": 1e-5, "normals": 1e-5}  # rounding, relative to the largest
 REPEATS = 5
@@ -42,7 +41,7 @@ def tabulate(degree: int) -> shading.Slices:
 
 
 def make_scene(path: Path, degree: int, pixels: int) -> None:
-    light = models.Environment.load(DATA / "interior.hdr").coefficients(degree)
+    light = models.Environment.load(_scene.DATA / "interior.hdr").coefficients(degree)
     rng = np.random.default_rng(0)
     normals, views = (_scene.unit(rng.normal(size=(pixels, 3))) for _ in range(2))
     views *= np.sign(np.sum(normals * views, axis=1, keepdims=True))
@@ -50,8 +49,12 @@ def make_scene(path: Path, degree: int, pixels: int) -> None:
     np.savez(path, light=light, slices=slices, normals=normals.astype(np.float32), views=views.astype(np.float32))
 
 
+def radiance(material, light, normals, views):
+    return shading.shade(material, models.DistantLight(light), shading.Surface(normals, views))
+
+
 def loss(light, normals, material, views):
-    return jnp.sum(shading.shade(material, models.DistantLight(light), shading.Surface(normals, views)) ** 2)
+    return jnp.sum(radiance(material, light, normals, views) ** 2)
 
 
 def worker(folder: Path, process: int) -> None:
@@ -76,7 +79,7 @@ def worker(folder: Path, process: int) -> None:
     @functools.cache
     def results(count: int):
         normals, views = shard("normals", count), shard("views", count)
-        forward = jax.jit(shading.shade_environment).lower(material, light, normals, views).compile()
+        forward = jax.jit(radiance).lower(material, light, normals, views).compile()
         backward = jax.jit(jax.grad(loss, (0, 1))).lower(light, normals, material, views).compile()
         return lambda: forward(material, light, normals, views), lambda: backward(light, normals, material, views)
 
@@ -146,8 +149,7 @@ def run(degree: int, pixels: int, devices: list[int], processes: int) -> list[di
     with tempfile.TemporaryDirectory() as folder:
         most = max(processes, *devices)
         make_scene(Path(folder) / "scene.npz", degree, pixels * most)
-        for i, (name, (count, each, cores)) in enumerate(runs.items()):
-            print(f"{name} ...", flush=True)
+        for i, (name, (count, each, cores)) in enumerate(_scene.progress(runs.items(), "runs", len(runs))):
             values, times = launch(Path(folder) / f"run_{i}", count, each, cores, pixels)
             first = first or {"values": values, **times}
             row = {"run": name, "devices": count * each, "pixels": pixels * count * each}
@@ -236,7 +238,9 @@ def main(arguments: list[str] | None = None) -> None:
     _scene.save(options.output / "many_devices.md", text + "\n")
     print(text)
     check(rows)
-    print(f"\nAll runs agree with one device. {time.perf_counter() - start:.0f} s, table in {options.output}/.")
+    worst = max(row[f"{name} difference"] for row in rows for name in TOLERANCE)
+    reached = f"Radiance and gradients of all {len(rows)} runs agree with one device to {worst:.1g}"
+    _scene.verdict(reached, start, options.output)
 
 
 if __name__ == "__main__":

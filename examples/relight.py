@@ -11,7 +11,6 @@ import csv
 import itertools
 import tempfile
 import time
-import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from io import StringIO
@@ -20,32 +19,11 @@ from pathlib import Path
 import _scene
 import jax
 import numpy as np
-from tqdm import tqdm
 
-from shisd import io, models, plotting, reference, shading
+from shisd import io, models, reference, shading
 
-DATA = Path(__file__).resolve().parent / "data"
 DEGREES = (4, 8, 16, 30)
-MAPS = {"interior": ("interior.hdr", 0.45, -0.363), "studio": ("studio.exr", 1.0, -0.451)}  # file, exposure, turns
-AZIMUTH = 5.0  # of the camera, in radians
-WORST, BEST = 1.0, 1e-3  # relative errors at the ends of the false-colour scale
-
-
-def gold_metallic_paint() -> models.SgdMicrofacet:
-    """MERL's gold-metallic-paint as fitted by Bagher, Soler and Holzschuch 2012 (supplement, row of that name)."""
-    return models.SgdMicrofacet(
-        np.array([0.0178625, 0.00995704, 0.00335044]),
-        np.array([0.17127, 0.120714, 0.115473]),
-        np.array([0.127954, 0.127825, 0.109623]),
-        np.array([0.781093, 0.795517, 0.661313]),
-        np.array([1.00776e-12, 1.22243e-15, 6.18432e-13]),
-        np.array([-1.0, -1.0, -0.334497]),
-        np.array([5.90039, 5.83556, 7.14985]),
-        np.array([2.7548, 2.7057, 2.94348]),
-        np.array([9.46481e-08, 1.06951e-07, 1.10733e-07]),
-        np.array([23.8811, 23.9059, 24.2972]),
-        np.array([-0.303345, -0.293778, -0.267019]),
-    )
+LIMITS = 1e-3, 1.0  # relative errors at the ends of the false-colour scale
 
 
 def through_a_merl_file(brdf: models.AbstractBrdf) -> models.MeasuredBrdf:
@@ -60,21 +38,8 @@ def materials() -> dict[str, models.AbstractBrdf]:
         "clay": models.Lambertian(np.array([0.75, 0.6, 0.5])),
         "red plastic": models.CookTorrance(roughness=0.5, metallic=0.0, albedo=np.array([0.6, 0.06, 0.05])),
         "copper": models.CookTorrance(roughness=0.45, metallic=1.0, albedo=np.array([0.95, 0.64, 0.54])),
-        "gold paint (measured)": through_a_merl_file(gold_metallic_paint()),
+        "gold paint (measured)": through_a_merl_file(_scene.gold_metallic_paint()),
     }
-
-
-def load_map(name: str) -> models.Environment:
-    """A map of the examples at 512 x 256, flipped so that the room is not mirrored, and turned about the vertical."""
-    file, _, turn = MAPS[name]
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        texels = models.Environment.load(DATA / file).texels
-    for warning in found:
-        print(f"note: {Path(str(warning.message)).name}")
-    step = texels.shape[0] // 256
-    texels = texels.reshape(256, step, 512, step, 3).mean(axis=(1, 3))
-    return models.Environment(np.roll(texels[:, ::-1], round(512 * turn), axis=1))
 
 
 def compare(image: np.ndarray, truth: np.ndarray, bar: np.ndarray) -> tuple[float, float]:
@@ -96,14 +61,14 @@ def best_time(function: Callable, *arguments) -> float:
 
 
 def error_picture(view: _scene.View, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    error = np.linalg.norm(image - truth, axis=1) / np.linalg.norm(truth, axis=1).mean()
-    return view.picture(plotting.false_colour(error, limits=(BEST, WORST)))
+    return view.picture(_scene.false_colour(image - truth, np.linalg.norm(truth, axis=1).mean(), LIMITS))
 
 
 def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ...]) -> list[dict]:
-    environments = {name: load_map(name) for name in MAPS}
+    environments = {name: _scene.load_map(name) for name in _scene.MAPS}
     brdfs = materials()
-    shapes = {"sphere": _scene.sphere(size, AZIMUTH), "rabbit": _scene.mesh(DATA / "bunny.ply", size, AZIMUTH)}
+    rabbit = _scene.mesh(_scene.DATA / "bunny.ply", size, _scene.AZIMUTH)
+    shapes = {"sphere": _scene.sphere(size, _scene.AZIMUTH), "rabbit": rabbit}
     normals = np.concatenate([view.normals for view in shapes.values()])  # all pixels of both objects at once
     views = np.concatenate([view.views for view in shapes.values()])
     split = np.cumsum([0, *(len(view.normals) for view in shapes.values())])
@@ -118,21 +83,20 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
         return np.asarray(estimate.value, float), np.asarray(estimate.standard_error, float)
 
     with ThreadPoolExecutor(2) as pool:
-        truths = dict(zip(jobs, tqdm(pool.map(integrate, jobs), "Monte Carlo", len(jobs)), strict=True))
+        truths = dict(zip(jobs, _scene.progress(pool.map(integrate, jobs), "Monte Carlo", len(jobs)), strict=True))
 
     # One table per material serves every degree: light without high bands does not see those of the slices.
-    slices = {name: shading.tabulate_brdf(brdf, max(degrees)) for name, brdf in tqdm(brdfs.items(), "slices")}
+    ready = {name: shading.tabulate_brdf(b, max(degrees)) for name, b in _scene.progress(brdfs.items(), "slices")}
     cases = list(itertools.product(brdfs, environments, degrees))
 
     def shade(case):
         material, light, degree = case
-        return shading.shade(
-            slices[material], models.DistantLight(coefficients[light, degree]), shading.Surface(normals, views)
-        )
+        return shading.shade(ready[material], lights[light, degree], surface)
 
-    coefficients = {(name, d): environments[name].coefficients(d) for name in environments for d in degrees}
+    surface = shading.Surface(normals, views)
+    lights = {(name, d): environments[name].light(d) for name in environments for d in degrees}
     images, rows = {}, []
-    for case in tqdm(cases, "shading"):
+    for case in _scene.progress(cases, "shading"):
         images[case] = np.asarray(shade(case), float)  # the first of each degree compiles
         material, light, degree = case
         row = {"material": material, "map": light, "degree": degree}
@@ -142,8 +106,8 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
         rows.append({**row, "us/pixel": 1e6 * best_time(shade, case) / len(normals)})
 
     gallery = []  # every object, room and material at the highest degree
-    for shape, light in tqdm(list(itertools.product(shapes, environments)), "pictures"):
-        view, exposure = shapes[shape], MAPS[light][1]
+    for shape, light in _scene.progress(list(itertools.product(shapes, environments)), "pictures"):
+        view, exposure = shapes[shape], _scene.MAPS[light][1]
         background = np.asarray(environments[light].radiance(view.rays.astype(np.float32), texels="samples"))
         show = lambda values, v=view, b=background, e=exposure: io.tonemap(v.picture(values, b), exposure=e)
         panels = {}
@@ -155,55 +119,18 @@ def run(output: Path, size: int, samples: int, seed: int, degrees: tuple[int, ..
                 panels[material].append((show(image), error_picture(view, image, truth)))
                 name = f"{shape}_{light}_{material.split(' (')[0].replace(' ', '-')}_degree{degree:02d}.png"
                 io.write_image(output / name, np.concatenate(panels[material][-1], axis=1), overwrite=True)
-        errors = {}
+        lines, notes = [], {}  # pictures of a material above their errors
         for material in brdfs:
             series = [r for r in rows if (r["material"], r["map"]) == (material, light)]
-            errors[material] = [series[0][f"{shape} noise"], *(r[f"{shape} error"] for r in series)]
-        contact_sheet(output / f"{shape}_{light}.png", f"{shape}, {light}", panels, degrees, errors)
+            errors = [series[0][f"{shape} noise"], *(r[f"{shape} error"] for r in series)]
+            notes |= {(len(lines) + 1, k): f"{'' if k else 'noise '}{100 * e:.2g} %" for k, e in enumerate(errors)}
+            above, below = zip(*panels[material], strict=True)
+            lines += [(material, list(above)), ("error", list(below))]
+        columns, file = ["Monte Carlo", *(f"degree {d}" for d in degrees)], output / f"{shape}_{light}.png"
+        _scene.sheet(file, columns, lines, limits=LIMITS, notes=notes, title=f"{shape}, {light}")
         gallery.append(np.concatenate([images[-1][0] for images in panels.values()], axis=1))
     io.write_image(output / "gallery.png", np.concatenate(gallery, axis=0), overwrite=True)
     return rows
-
-
-def contact_sheet(path: Path, title: str, panels: dict, degrees: tuple[int, ...], errors: dict) -> None:
-    """All materials and degrees of one object in one room: pictures above, their errors below."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import patheffects, pyplot
-
-    columns = len(degrees) + 1
-    ink, paper = "#e8e6e3", "#17181b"
-    halo = [patheffects.withStroke(linewidth=2.5, foreground="black")]
-    with pyplot.rc_context({"text.color": ink, "font.size": 9, "axes.edgecolor": ink}):
-        height = 1 + 1.62 * 2 * len(panels)
-        figsize = (1.62 * columns + 0.4, height)
-        figure, grid = pyplot.subplots(2 * len(panels), columns, figsize=figsize, facecolor=paper)
-        margins = {"left": 0.06, "right": 0.99, "top": 1 - 0.75 / height, "bottom": 0.45 / height}
-        figure.subplots_adjust(**margins, wspace=0.03, hspace=0.03)
-        for axes in grid.flat:
-            axes.set_axis_off()
-        for i, (material, images) in enumerate(panels.items()):
-            side = grid[2 * i, 0]
-            side.text(-0.06, 0.5, material, rotation=90, ha="right", va="center", transform=side.transAxes)
-            for k, (image, error) in enumerate(images):
-                grid[2 * i, k].imshow(image, interpolation="nearest")
-                below = grid[2 * i + 1, k]
-                below.imshow(error, interpolation="nearest")
-                text = f"{'' if k else 'noise '}{100 * errors[material][k]:.2g} %"
-                below.text(0.97, 0.04, text, ha="right", transform=below.transAxes, path_effects=halo)
-        for k, name in enumerate(["Monte Carlo", *(f"degree {d}" for d in degrees)]):
-            grid[0, k].set_title(name, color=ink, fontsize=10)
-        figure.suptitle(title, x=0.06, ha="left", y=1 - 0.18 / height, fontsize=13)
-        scale = figure.add_axes((0.62, 0.22 / height, 0.3, 0.1 / height))
-        ramp = np.geomspace(BEST, WORST, 256)[None]
-        scale.imshow(plotting.false_colour(ramp, limits=(BEST, WORST)), aspect="auto", extent=(-3, 0, 0, 1))
-        scale.set_yticks([])
-        scale.set_xticks([-3, -2, -1, 0], ["0.1 %", "1 %", "10 %", "100 %"], color=ink, fontsize=7)
-        scale.tick_params(length=0, pad=1)
-        figure.text(0.595, 0.2 / height, "error / mean radiance", ha="right", fontsize=8)
-        _scene.save(path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper))
-        pyplot.close(figure)
 
 
 def percent(error: float, noise: float) -> str:
@@ -257,10 +184,10 @@ def main(arguments: list[str] | None = None) -> None:
     print(table(rows))
     check(rows)
     worst = max(max(r["sphere error"], r["rabbit error"]) for r in rows if r["degree"] == max(options.degrees))
-    print(
-        f"\nErrors fall with degree for every material and map; at degree {max(options.degrees)} the worst is "
-        f"{100 * worst:.2g} %. {time.perf_counter() - start:.0f} s, pictures in {options.output}/."
+    reached = (
+        f"Radiance within {100 * worst:.2g} % of Monte Carlo at degree {max(options.degrees)}, for the worst picture"
     )
+    _scene.verdict(f"{reached}. Errors fall with degree for every material and map", start, options.output)
 
 
 if __name__ == "__main__":

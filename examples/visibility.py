@@ -2,65 +2,67 @@
 
 Rays from every vertex, cast once, give the visibility of the room as spherical harmonic coefficients. Pixels
 interpolate them and integrate light times visibility times material (ISD15 Eq. 25). The last column casts rays at every
-pixel.
+pixel. Below each picture is its error.
 
     python examples/visibility.py --output output/visibility
 """
 
+import time
 from pathlib import Path
 
 import _scene
 import jax
 import numpy as np
-from relight import DATA, MAPS, load_map
-from tqdm import tqdm
 
 from shisd import io, models, reference, shading
 
-AZIMUTH, DEGREE, SEEN = 5.0, 16, (4, 12)
+DEGREE, SEEN = 16, (4, 12)
+LIMITS = 1e-3, 1.0  # relative errors at the ends of the false-colour scale
 PLASTIC = models.CookTorrance(roughness=0.6, metallic=0.0, albedo=np.array([0.6, 0.3, 0.2]))
 
 
 def run(output: Path, size: int, samples: int, rays: int, seed: int) -> list[dict]:
-    shape, view = _scene.load_mesh(DATA / "bunny.ply"), _scene.mesh(DATA / "bunny.ply", size, AZIMUTH)
-    where = {"triangle": view.triangle, "weights": view.weights}
-    off = 1e-4 * np.linalg.norm(np.ptp(shape.vertices, axis=0))  # rays start off the surface
-    starts = (view.positions + off * shape.face_normals[view.triangle]).astype(np.float32)
+    rabbit = _scene.DATA / "bunny.ply"
+    shape, view = _scene.load_mesh(rabbit), _scene.mesh(rabbit, size, _scene.AZIMUTH)
+    starts = (view.positions + 2e-4 * shape.face_normals[view.triangle]).astype(
+        np.float32
+    )  # rays start off the surface
     visible = lambda p, w: ~shape.ray.intersects_any(p, w)
 
-    material = shading.tabulate_brdf(PLASTIC, DEGREE)
-    make = lambda degree: models.Visibility.from_mesh(shape.vertices, shape.faces, degree, rays=rays, seed=seed)
-    seen = {degree: make(degree) for degree in tqdm(SEEN, "visibility")}
+    slices, surface = shading.tabulate_brdf(PLASTIC, DEGREE), view.surface()
+    make = lambda degree: models.Visibility.from_mesh(
+        shape.vertices, shape.faces, degree, rays=rays, seed=seed, progress=_scene.PROGRESS
+    )
+    seen = {degree: make(degree) for degree in SEEN}
 
-    rows, gallery = [], []
-    for name in tqdm(MAPS, "maps"):
-        environment, exposure = load_map(name), MAPS[name][1]
-        light = environment.coefficients(DEGREE + max(SEEN))
-        images = {
-            "no occlusion": shading.shade(
-                material, models.DistantLight(light), shading.Surface(view.normals, view.views)
-            )
-        }
+    rows, lines, notes = [], [], {}
+    for name in _scene.progress(_scene.MAPS, "maps"):
+        environment, exposure = _scene.load_map(name), _scene.MAPS[name][1]
+        light = environment.light(DEGREE + max(SEEN))
+        images = {"no occlusion": shading.shade(slices, light, surface)}
         for degree, v in seen.items():
-            images[f"degree {degree}"] = shading.shade_environment_visibility(
-                material, light, v, view.normals, view.views, **where
-            )
+            images[f"visibility of degree {degree}"] = shading.shade(slices, models.Occluded(light, v), surface)
         truth = reference.shade_environment(
             PLASTIC, environment, view.normals, view.views,
             key=jax.random.key(seed), samples=samples, positions=starts, visible=visible,
         )  # fmt: skip
-        images["rays"], noise2 = truth.value, np.mean(np.asarray(truth.standard_error, float) ** 2)
+        exact, bar = (np.asarray(a, float) for a in (truth.value, truth.standard_error))
+        images = {method: np.asarray(image, float) for method, image in images.items()} | {"rays": exact}
+        noise2, scale = np.mean(bar**2), np.mean(exact**2)
         background = np.asarray(environment.radiance(view.rays.astype(np.float32), texels="samples"))
-        gallery.append(np.concatenate([
-            io.tonemap(view.picture(np.asarray(image), background), exposure=exposure) for image in images.values()
-        ], axis=1))  # fmt: skip
-        scale = np.mean(np.asarray(truth.value, float) ** 2)
-        for method, image in images.items():
+        shown = [io.tonemap(view.picture(image, background), exposure=exposure) for image in images.values()]
+        mean = np.linalg.norm(exact, axis=1).mean()
+        errors = [image - exact if method != "rays" else bar for method, image in images.items()]
+        wrong = [view.picture(_scene.false_colour(error, mean, LIMITS)) for error in errors]
+        for k, method in enumerate(images):
+            noise = np.sqrt(noise2 / scale)
             if method != "rays":
-                excess = np.mean((np.asarray(image, float) - np.asarray(truth.value, float)) ** 2) - noise2
-                row = {"map": name, "method": method, "error": np.sqrt(max(excess, 0) / scale)}
-                rows.append({**row, "noise": np.sqrt(noise2 / scale)})
-    io.write_image(output / "visibility.png", np.concatenate(gallery, axis=0), overwrite=True)
+                error = np.sqrt(max(np.mean(errors[k] ** 2) - noise2, 0) / scale)
+                rows.append({"map": name, "method": method, "error": error, "noise": noise})
+            notes[len(lines) + 1, k] = f"noise {100 * noise:.2g} %" if method == "rays" else f"{100 * error:.2g} %"
+        lines += [(name, shown), ("error", wrong)]
+    columns = ["no occlusion", *(f"visibility of degree {d}" for d in SEEN), f"{samples} rays at every pixel"]
+    _scene.sheet(output / "visibility.png", columns, lines, limits=LIMITS, notes=notes)
     return rows
 
 
@@ -88,10 +90,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     _scene.prepare_output(options.output, options.overwrite, "visibility", parser)
+    start = time.perf_counter()
     rows = run(options.output, options.size, options.samples, options.rays, options.seed)
     _scene.save(options.output / "visibility.md", table(rows) + "\n")
     print(table(rows))
     check(rows)
+    worst = max(r["error"] for r in rows if r["method"].endswith(f" {SEEN[-1]}"))
+    none = max(r["error"] for r in rows if r["method"] == "no occlusion")
+    reached = (
+        f"Radiance within {100 * worst:.2g} % of rays by visibility of degree {SEEN[-1]} ({100 * none:.2g} % without)"
+    )
+    _scene.verdict(reached, start, options.output)
 
 
 if __name__ == "__main__":

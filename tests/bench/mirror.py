@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from examples._scene import camera_rays, hits, load_mesh, unit
+from examples._scene import camera_rays, hits, load_mesh, sphere_hits, unit
 from shisd import harmonics, models, shading
 from shisd._numerics import normalize
 from shisd.harmonics.internal import sample_map
@@ -46,7 +46,7 @@ class Images:
 @functools.cache
 def images(name: str, side: int) -> Images:
     """The object as rays through the centres of side x side pixels meet it."""
-    eye = (4.2 if name == "sphere" else 4.4) * np.array([np.cos(0.7), np.sin(0.7), 0.2])
+    eye = (4.2 if name == "sphere" else 3.8) * np.array([np.cos(0.7), np.sin(0.7), 0.2])
     rays = camera_rays(side, eye, np.zeros(3), np.radians(32 if name == "sphere" else 29))
     seen, normals, positions = (_sphere if name == "sphere" else _rabbit)(eye, rays.reshape(-1, 3))
     image = lambda a: a.astype(np.float32).reshape(side, side, 3)
@@ -54,10 +54,8 @@ def images(name: str, side: int) -> Images:
 
 
 def _sphere(eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    along = -rays @ eye
-    inside = along**2 - eye @ eye + 1
-    points = eye + (along - np.sqrt(np.maximum(inside, 0)))[:, None] * rays
-    return inside > 0, points, points
+    seen, points = sphere_hits(eye, rays)
+    return seen, points, points
 
 
 def _rabbit(eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
