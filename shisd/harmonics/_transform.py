@@ -22,12 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import normalize, safe_sqrt
 from shisd._sharding import by_device
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, ArrayLike, DTypeLike, Float
 from shisd.harmonics import _layout, _quadrature, _tables
 
 Rows = Literal["gauss", "fejer", "cells"]

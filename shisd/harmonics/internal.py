@@ -21,5 +21,6 @@ from shisd.harmonics._tables import host_basis as host_basis
 from shisd.harmonics._tables import quarter_mirror as quarter_mirror
 from shisd.harmonics._tables import swap_matrices as swap_matrices
 from shisd.harmonics._tables import zonal_norms as zonal_norms
+from shisd.harmonics._transform import sample_map as sample_map
 from shisd.harmonics._transform import series_table as series_table
 from shisd.harmonics._zh import legendre_of_versine as legendre_of_versine

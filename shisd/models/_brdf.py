@@ -14,12 +14,11 @@ from typing import ClassVar, TypeVar, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._module import Module
 from shisd._numerics import normalize, safe_sqrt
-from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar, Vector
 
 Colour = Float[Array, "..."]  # () or (3,); the parameters of one model may mix both
 Parameter = ArrayLike | Sequence[float]

@@ -67,8 +67,13 @@ def as_material(material: object) -> Material:
             return Material(material, material)
         case Slices():
             return Material(None, material)
-        case BrdfMatrix():
+        case BrdfMatrix(domain="sphere"):
             return Material(material)
+        case BrdfMatrix():
+            raise ValueError(
+                "`material` is a BrdfMatrix that was fitted above the horizon only: for polygons and portals pass its "
+                "`slices()`, for other lights one with domain='sphere'."
+            )
     hint = " Make it ready by shading.prepare." if isinstance(material, AbstractBrdf) else ""
     came = type(material).__name__
     raise ValueError(f"`material` must come from shading.prepare, tabulate_brdf or project_brdf; got {came}.{hint}")

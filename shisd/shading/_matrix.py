@@ -20,13 +20,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import angle_multiples, safe_sqrt
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, DTypeLike, Float, Scalar
 from shisd.harmonics import sh_basis
 from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis, of_order
 from shisd.models import AbstractBrdf
@@ -43,11 +42,11 @@ class BrdfMatrix(Module):
 
     blocks: for isotropic materials, the block [*colour, L+1-m, Lv+1-m] of every order m up to the lesser of L and Lv,
     rows l = m ... L and columns l' = m ... Lv; for anisotropic ones the whole F [*colour, (L+1)^2, (Lv+1)^2] alone.
-    `quadrature_error` and `domain` as in `Slices`. F means something for views above the horizon only.
+    `error` and `domain` as in `Slices`. F means something for views above the horizon only.
     """
 
     blocks: tuple[Float[Array, "*colour _ _"], ...]
-    quadrature_error: Scalar
+    error: Scalar
     degree: int = eqx.field(static=True)
     view_degree: int = eqx.field(static=True)
     isotropic: bool = eqx.field(static=True)
@@ -87,7 +86,7 @@ class BrdfMatrix(Module):
         y = host_basis(_directions(*(a.ravel() for a in grid)), self.view_degree)
         c = jnp.einsum("...ij,vj->...vi", self.matrix(), jnp.asarray(y, self.blocks[0].dtype))
         c = c if self.isotropic else c.reshape(*self.colour, *grid[0].shape, -1)
-        return Slices(c, quadrature_error=self.quadrature_error, isotropic=self.isotropic, domain=self.domain)
+        return Slices(c, error=self.error, isotropic=self.isotropic, domain=self.domain)
 
 
 def project_brdf(

@@ -23,7 +23,7 @@ from shisd._module import Module
 from shisd._numerics import angle_multiples, normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import project_map, sample_map, synthesize_map
+from shisd.harmonics import project_map, synthesize_map
 from shisd.harmonics.internal import (
     angles_of,
     bands,
@@ -32,6 +32,7 @@ from shisd.harmonics.internal import (
     pair_many,
     place,
     rows,
+    sample_map,
     series_table,
     turned_series,
     zonal_norms,
@@ -103,7 +104,7 @@ def reflect(
 
     Derivatives: in every floating argument, both modes, also where the footprint is round or a point. With light as
     coefficients those of second order are NaN at mirror directions along the z axis; with maps those in directions jump
-    between texels, as in `harmonics.sample_map`, and those in variances between levels.
+    between texels, as in `Environment.radiance`, and those in variances between levels.
     """
     points, dtype = _points(footprint, mask)
     if isinstance(light, MirrorMaps):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from shisd._typing import Array, Float
 from shisd.models import DistantLight, Environment, Occluded, PolygonLight, PortalLight, SphereLight, ZonalLight
@@ -17,7 +18,7 @@ from shisd.shading.paths import _distant, _occluded, _polygon, _sphere, _zonal
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices
 
-Light = DistantLight | ZonalLight | Occluded | PolygonLight | PortalLight | SphereLight
+Light = TypeAliasType("Light", DistantLight | ZonalLight | Occluded | PolygonLight | PortalLight | SphereLight)
 PATHS: dict[type, Path] = {
     DistantLight: _distant.PATH,
     ZonalLight: _zonal.PATH,
@@ -88,7 +89,8 @@ def shade(
         value = path.radiance(form, as_type(group, dtype), own, surface)
         batch = value.shape[: value.ndim - len(colour)]
         parts.append(value.reshape(*batch, *(1,) * (most - len(colour)), *colour))
-    return functools.reduce(jnp.add, parts)
+    shape = np.broadcast_shapes(*(part.shape for part in parts))
+    return functools.reduce(jnp.add, (jnp.broadcast_to(part, shape) for part in parts))
 
 
 def _known(lights: Light | Sequence[Light]) -> list[Light]:

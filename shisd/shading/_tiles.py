@@ -12,10 +12,9 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd._numerics import normalize
-from shisd._typing import Array, Float
+from shisd._typing import Array, DTypeLike, Float
 from shisd.shading._frames import frame, tangent_frame
 
 Shape = tuple[int, ...]
