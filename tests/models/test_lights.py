@@ -97,11 +97,10 @@ def test_outlines_are_not_numbers_where_something_is_not(kind, dtype):
     assert np.isnan(vertices(array(corners("square"), dtype), array([0, np.nan, 0], dtype))).any()
 
 
-@pytest.mark.parametrize("kind", LIGHTS)
-def test_one_outline_is_as_in_a_batch(kind, x64):
+def test_one_outline_is_as_in_a_batch(x64):
     points, places = array(corners("not convex"), np.float64), array(ORIGINS, np.float64)
-    single = [domains.solid_angle(LIGHTS[kind](points).outline(o)) for o in places]
-    np.testing.assert_allclose(areas(kind, points, places), single, rtol=1e-14)
+    single = [domains.solid_angle(LIGHTS["one-sided"](points).outline(o)) for o in places]
+    np.testing.assert_allclose(areas("one-sided", points, places), single, rtol=1e-14)
 
 
 @pytest.mark.parametrize("name", OUTLINES)
@@ -248,7 +247,7 @@ def test_every_material_is_here():
 
 
 def _prepared(brdf):
-    material = shading.prepare(brdf, DEGREE, elevations=4, azimuths=8, quadrature=48, throw=False)
+    material = shading.prepare(brdf, DEGREE, elevations=4, azimuths=4, quadrature=48, throw=False)
     return material.distant.coefficients, material.local.coefficients
 
 
@@ -258,14 +257,14 @@ def _along_slices(brdf, move):
 
 
 @eqx.filter_jit
-def _by_slices(made, isotropic, lights, surface):
-    def value(made):
+def _along_radiance(slices, slope, isotropic, lights, surface):
+    def value(slices):
         distant, local = (
-            shading.Slices(c, isotropic=isotropic, domain=d) for c, d in zip(made, ("sphere", "upper"), strict=True)
+            shading.Slices(c, isotropic=isotropic, domain=d) for c, d in zip(slices, ("sphere", "upper"), strict=True)
         )
         return _weighted(shading.shade(shading.Material(distant, local), lights, surface))
 
-    return jax.value_and_grad(value)(made)
+    return jax.jvp(value, (slices,), (slope,))
 
 
 @pytest.mark.parametrize("name", MATERIALS)
@@ -275,9 +274,7 @@ def test_every_field_of_a_material_is_in_the_gradient(name, x64, rng, surface):
     lights = [models.DistantLight(rng.uniform(0.5, 1, 9)), models.PolygonLight(corners("square")[:4])]
 
     def value_and_slope(brdf, move):
-        slices, slope = _along_slices(brdf, move)
-        value, by_slices = _by_slices(slices, brdf.isotropic, lights, surface)
-        return value, sum(np.vdot(a, b) for a, b in zip(by_slices, slope, strict=True))
+        return _along_radiance(*_along_slices(brdf, move), brdf.isotropic, lights, surface)
 
     check_fields(brdf, value_and_slope, rng)
 
