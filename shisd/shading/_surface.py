@@ -1,5 +1,6 @@
 """Surface points: where they are, which way they face, and from where they are seen."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -85,6 +86,8 @@ def _indices(triangles: ArrayLike) -> Array:
     array = _checks.any_array("triangles", triangles)
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"`triangles` must be integers [...]; got dtype {array.dtype}.")
+    if not isinstance(triangles, jax.Array) and np.any(np.asarray(triangles) != np.asarray(array)):
+        raise ValueError(f"`triangles` must fit into {array.dtype}; got up to {np.max(np.abs(triangles))}.")
     return array
 
 
