@@ -1,12 +1,12 @@
 """What a picture needs besides shading: a camera, an object's visible points, pixels in their places, and a folder."""
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
-
-from shisd import io
 
 
 @dataclass
@@ -52,7 +52,15 @@ def prepare_output(folder: Path, overwrite: bool, name: str, parser: argparse.Ar
         if not folder.is_dir() or not (mark.is_file() or not any(folder.iterdir())):
             parser.error(f"{folder} was not made by this program and is left alone. Name another --output.")
     folder.mkdir(parents=True, exist_ok=True)
-    io.write_atomically(mark, f"Files here may be replaced by {name}.py --overwrite.\n", overwrite=True)
+    save(mark, f"Files here may be replaced by {name}.py --overwrite.\n")
+
+
+def save(path: Path, content: str | Callable[[IO[bytes]], object]) -> None:
+    """Put a text, or what a function writes to a binary file, in the place of what is there, whole or not at all."""
+    beside = path.with_name(f".{path.name}.part")
+    with beside.open("wb") as file:
+        file.write(content.encode()) if isinstance(content, str) else content(file)
+    beside.replace(path)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

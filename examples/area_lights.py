@@ -185,9 +185,7 @@ def sheet(path: Path, panels: dict) -> None:
         scale.set_xticks([-6, -4, -2], ["1e-6", "1e-4", "1e-2"], color=ink, fontsize=7)
         scale.tick_params(length=0, pad=1)
         figure.text(0.665, 0.22 / height, "error / mean radiance", ha="right", fontsize=8)
-        io.write_atomically(
-            path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper), overwrite=True
-        )
+        _scene.save(path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper))
         pyplot.close(figure)
 
 
@@ -222,7 +220,7 @@ def main(arguments: list[str] | None = None) -> None:
     start = time.perf_counter()
     rows = run(options.output, options.size, options.nodes)
     text = table(rows, options.nodes)
-    io.write_atomically(options.output / "area_lights.md", text + "\n", overwrite=True)
+    _scene.save(options.output / "area_lights.md", text + "\n")
     print(text)
     check(rows)
     print(f"\n{time.perf_counter() - start:.0f} s, pictures in {options.output}/.")

@@ -55,7 +55,7 @@ def run(output: Path, size: int, noise: float, holes: float, seed: int) -> list[
     panels += [io.tonemap(view.picture(5 * error), exposure=EXPOSURE) for error in errors]
     io.write_image(output / "denoise.png", np.concatenate(panels, axis=1), overwrite=True)
 
-    above = io.merl_above_horizon()
+    above = truth >= 0  # missing bins are negative: those below the horizon
     rms = lambda x: np.sqrt(np.mean(np.square(x)))
     rows = []
     for name in ("as read", "denoised"):
@@ -82,7 +82,7 @@ def main() -> None:
     options = parser.parse_args()
     _scene.prepare_output(options.output, options.overwrite, "denoise", parser)
     rows = run(options.output, options.size, options.noise, options.holes, options.seed)
-    io.write_atomically(options.output / "denoise.md", table(rows) + "\n", overwrite=True)
+    _scene.save(options.output / "denoise.md", table(rows) + "\n")
     print(table(rows))
     if rows[1]["table"] > rows[0]["table"] / 3:
         raise SystemExit("The denoised table should be at least three times nearer to the clean one.")

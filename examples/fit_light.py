@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from shisd import io, models, shading
+from shisd import models, shading
 
 DATA = Path(__file__).resolve().parent / "data"
 LIGHT_DEGREE = 3
@@ -155,7 +155,7 @@ def main(arguments: list[str] | None = None) -> None:
         rows = run(options.output, options.size, options.steps, options.noisy)
     _fit.write_csv(options.output / "fit_light.csv", rows)
     text = table(rows)
-    io.write_atomically(options.output / "fit_light.md", text + "\n", overwrite=True)
+    _scene.save(options.output / "fit_light.md", text + "\n")
     print(text)
     assert rows[0].error < 1, f"the lamp is {rows[0].error:.2g} % of its distance from its place"
     print(f"\n{time.perf_counter() - start:.0f} s, picture in {options.output}/.")

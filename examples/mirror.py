@@ -88,7 +88,7 @@ def main() -> None:
     options = parser.parse_args()
     _scene.prepare_output(options.output, options.overwrite, "mirror", parser)
     rows = run(options.output, options.size)
-    io.write_atomically(options.output / "mirror.md", table(rows) + "\n", overwrite=True)
+    _scene.save(options.output / "mirror.md", table(rows) + "\n")
     print(table(rows))
 
 

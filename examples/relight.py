@@ -202,9 +202,7 @@ def contact_sheet(path: Path, title: str, panels: dict, degrees: tuple[int, ...]
         scale.set_xticks([-3, -2, -1, 0], ["0.1 %", "1 %", "10 %", "100 %"], color=ink, fontsize=7)
         scale.tick_params(length=0, pad=1)
         figure.text(0.595, 0.2 / height, "error / mean radiance", ha="right", fontsize=8)
-        io.write_atomically(
-            path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper), overwrite=True
-        )
+        _scene.save(path, lambda file: figure.savefig(file, format="png", dpi=110, facecolor=paper))
         pyplot.close(figure)
 
 
@@ -254,8 +252,8 @@ def main(arguments: list[str] | None = None) -> None:
     writer = csv.DictWriter(text, rows[0])
     writer.writeheader()
     writer.writerows(rows)
-    io.write_atomically(options.output / "relight.csv", text.getvalue(), overwrite=True)
-    io.write_atomically(options.output / "relight.md", table(rows) + "\n", overwrite=True)
+    _scene.save(options.output / "relight.csv", text.getvalue())
+    _scene.save(options.output / "relight.md", table(rows) + "\n")
     print(table(rows))
     check(rows)
     worst = max(max(r["sphere error"], r["rabbit error"]) for r in rows if r["degree"] == max(options.degrees))

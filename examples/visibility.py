@@ -89,7 +89,7 @@ def main() -> None:
     options = parser.parse_args()
     _scene.prepare_output(options.output, options.overwrite, "visibility", parser)
     rows = run(options.output, options.size, options.samples, options.rays, options.seed)
-    io.write_atomically(options.output / "visibility.md", table(rows) + "\n", overwrite=True)
+    _scene.save(options.output / "visibility.md", table(rows) + "\n")
     print(table(rows))
     check(rows)
 

@@ -8,11 +8,11 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks, harmonics, io
 from shisd._module import Module
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, ArrayLike, DTypeLike, Float
+from shisd.harmonics.internal import sample_map
 from shisd.models.lights._distant import DistantLight
 
 
@@ -131,14 +131,14 @@ class Environment(Module):
     def radiance(
         self, directions: ArrayLike, *, texels: Literal["cells", "samples"] = "cells"
     ) -> Float[Array, "*batch_and_colour"]:
-        """Radiance [..., *colour] from directions [..., 3], by `shisd.harmonics.sample_map`: that of the texel there.
+        """Radiance [..., *colour] from directions [..., 3]: that of the texel there.
 
         With texels="samples" bilinear between texel centres: smooth in a picture, but next to the poles of another
         power. Directions of any length are accepted; a zero vector or one that is not finite gives NaN. Output dtype is
         that of the directions. Derivatives: in texels and directions; those in directions are 0, or between samples
         jump from texel to texel.
         """
-        return harmonics.sample_map(self.texels, directions, texels=texels)
+        return sample_map(self.texels, directions, texels=texels)
 
 
 _UP = {"shisd": "z", "blender": "z", "mitsuba": "y"}

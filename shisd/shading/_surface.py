@@ -47,7 +47,7 @@ class Surface(Module):
         self.positions, self.tangents = arrays.get("positions"), arrays.get("tangents")
         self.barycentric = arrays.get("barycentric")
         self.mask = None if mask is None else bools(mask)
-        self.triangles = None if triangles is None else _checks.any_array("triangles", triangles)
+        self.triangles = None if triangles is None else _indices(triangles)
         if (triangles is None) != (barycentric is None):
             raise ValueError("`triangles` [...] and `barycentric` [..., 3] belong together: pass both or none.")
         shapes = {name: a.shape[:-1] for name, a in arrays.items()}
@@ -78,6 +78,13 @@ def bools(mask: ArrayLike) -> Array:
     array = jnp.asarray(mask)
     if array.dtype != bool:
         raise ValueError(f"`mask` must be bool [...], True where there is a surface; got dtype {array.dtype}.")
+    return array
+
+
+def _indices(triangles: ArrayLike) -> Array:
+    array = _checks.any_array("triangles", triangles)
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise ValueError(f"`triangles` must be integers [...]; got dtype {array.dtype}.")
     return array
 
 

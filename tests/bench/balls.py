@@ -1,4 +1,4 @@
-"""Balls of light over a glossy floor: error and cost of zonal lights, beside Monte Carlo.
+"""Balls of light over a glossy floor: error and cost of `shade` with a `SphereLight`, beside Monte Carlo.
 
 The truth is Gauss quadrature over the cap that the ball covers, of the material itself, 48 nodes by 96, in float64 on a
 part of the points. Monte Carlo takes directions uniform over the cap from a lattice that is shifted for every point.
@@ -9,10 +9,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from shisd.models._light import versine
 
 from shisd import models, shading
 from shisd.models import SphereLight
+from shisd.models.internal import versine
 from tests.bench.area_lights import lattice
 from tests.bench.timing import interleaved
 
@@ -62,6 +62,7 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     x, w = np.polynomial.legendre.leggauss(48)
     u, v = np.meshgrid((x + 1) / 2, np.arange(96) / 96, indexing="ij")
     fine = np.stack([u.ravel(), v.ravel()], axis=1), np.repeat(w / 2, 96) / 96
+    shaded = lambda material, light: shading.shade(material, light, shading.Surface(normals, views, positions))
     rows = []
     for name, brdf in list(MATERIALS.items())[: 1 if quick else None]:
         for ball, (center, radius) in BALLS.items():
@@ -73,8 +74,7 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             methods = {}
             for degree in (8, 16):
                 material = shading.tabulate_brdf(brdf, degree)
-                shade = functools.partial(shading.shade_sphere, material, light, positions, normals, views)
-                methods[f"zonal light, degree {degree}"] = shade
+                methods[f"shade, SphereLight, degree {degree}"] = functools.partial(shaded, material, light)
             for count in (16, 64):
                 uv, weight = lattice(count).astype(np.float32), np.full(count, 1 / count, np.float32)
                 sampled = jax.jit(functools.partial(over_caps, brdf, light, uv, weight))

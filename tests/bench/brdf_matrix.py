@@ -2,8 +2,8 @@
 
 Errors are relative RMSEs over views, by solid angle, of functions on the sphere: that of the light's side is what the
 slices lack above their degree, the same in both representations; that of the view's side is what interpolating or
-expanding adds. Both against the material itself. Times are of `shade_environment` and `shade_matrix` on random normals
-and views under a light of three colours, interleaved; of isotropic materials one stands for all.
+expanding adds. Both against the material itself. Times are of `shade` on random normals and views under a
+`DistantLight` of three colours, interleaved; of isotropic materials one stands for all.
 """
 
 import functools
@@ -47,10 +47,6 @@ def slices(brdf: models.AbstractBrdf, degree: int, theta: np.ndarray) -> tuple[n
     return np.asarray(c, float), np.asarray(squares, float)
 
 
-def _verb(material: shading.Slices | shading.BrdfMatrix):
-    return shading.shade_matrix if isinstance(material, shading.BrdfMatrix) else shading.shade_environment
-
-
 def tables(quick: bool) -> dict[str, list[dict]]:
     """Title and rows of the table; nothing when quick."""
     if quick:
@@ -64,7 +60,8 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     local = jnp.asarray(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1), jnp.float32)
     rows = []
     for degree in (8, 16):
-        light = jnp.asarray(rng.normal(size=(3, (degree + 1) ** 2)), jnp.float32)
+        light = models.DistantLight(jnp.asarray(rng.normal(size=(3, (degree + 1) ** 2)), jnp.float32))
+        shaded = lambda m, v, light=light: shading.shade(m, light, shading.Surface(normals, v, tangents=tangents))
         for name, brdf in MATERIALS.items():
             if degree > 8 and not brdf.isotropic:
                 continue
@@ -75,9 +72,7 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             made = {f"table, {v} views": shading.tabulate_brdf(brdf, degree, elevations=v) for v in TABLES}
             made |= {f"matrix, view degree {v}": shading.project_brdf(brdf, degree, view_degree=v) for v in MATRICES}
             if name in TIMED:
-                shade: dict[Hashable, Callable] = {
-                    key: functools.partial(_verb(m), m, light, normals, tangents=tangents) for key, m in made.items()
-                }
+                shade: dict[Hashable, Callable] = {key: functools.partial(shaded, m) for key, m in made.items()}
                 slope: dict[Hashable, Callable] = {
                     key: jax.jit(jax.grad(lambda v, f=f: jnp.sum(f(v) ** 2))) for key, f in shade.items()
                 }

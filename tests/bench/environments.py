@@ -3,8 +3,8 @@
 The reference is quadrature over every texel, each in four parts, in float64 (`shisd.reference`): python -m
 tests.bench.environments --make. Its error is the difference to sixteen parts, of a few pixels.
 
-ours: slices on rotated zonal harmonics, `shading.shade_environment`; maps filtered for the material,
-`shading.shade_prefiltered`; for clay also its irradiance, ISD15 Eq. 13.
+ours: slices by view, `shading.shade` with a `DistantLight`; maps filtered for the material, `shading.prefilter`; for
+clay also its irradiance, ISD15 Eq. 13.
 Monte Carlo, point lights: tests/bench/monte_carlo.py. SH rotation: tests/bench/sh_rotation.py, on the same slices.
 Split sum: tests/bench/split_sum.py. Spherical Gaussians: tests/bench/lobes.py.
 Gradients: value and derivatives in normals, views, and the light's coefficients, texels or filtered texels, of a sum
@@ -26,7 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, io, models, reference, shading
+from shisd import decomposition, harmonics, models, reference, shading
+from shisd.io.internal import write_atomically
 from tests.bench import lobes, monte_carlo, sh_rotation, split_sum
 from tests.bench.harness import Method, Task
 from tests.bench.timing import timed
@@ -124,13 +125,12 @@ def tables(material: str):
     brdf, most = MATERIALS[material], DEGREES[-1]
     kind = type(brdf).__name__
     table, seconds = timed(lambda: shading.tabulate_brdf(brdf, most, elevations=VIEWS, quadrature=64), kind)
-    return {degree: shading.Slices(table.coefficients[..., : (degree + 1) ** 2]) for degree in (2, *DEGREES)}, seconds
+    return {degree: table.cut(degree) for degree in (2, *DEGREES)}, seconds
 
 
 def shade(parameters, normals, views):
-    return shading.shade(
-        parameters["material"], models.DistantLight(parameters["light"]), shading.Surface(normals, views)
-    )
+    light = models.DistantLight(parameters["light"])
+    return shading.shade(parameters["material"], light, shading.Surface(normals, views))
 
 
 def shade_diffuse(parameters, normals, views):
@@ -164,7 +164,7 @@ def sharp_table(material: str, degree: int):
     return timed(lambda: shading.tabulate_brdf(brdf, degree, quadrature=64 + degree), f"{type(brdf).__name__} {degree}")
 
 
-def shade_prefiltered(parameters, normals, views):
+def filtered_radiance(parameters, normals, views):
     filtered = eqx.tree_at(lambda x: x.maps, parameters["filtered"], parameters["maps"])
     return filtered.radiance(shading.Surface(normals, views))
 
@@ -173,14 +173,14 @@ def prefiltered(scene: Scene) -> list[Method]:
     methods = []
     for degree in (30,) if scene.quick or scene.material != "GGX 0.1" else (30, 64):
         material, seconds = sharp_table(scene.material, degree)
-        light = coefficients(scene.map)[0][:, : (degree + 1) ** 2]
+        light = models.DistantLight(coefficients(scene.map)[0][:, : (degree + 1) ** 2])
         tolerances = (0.1, 0.05, 0.02, 0.005) if degree == 30 else (0.01,)
         for tolerance in scene.some(tolerances if scene.glossy else (0.01,)):
             make = functools.partial(shading.prefilter, material, light, tolerance=tolerance)
             make()  # compiles, for every number of channels again
             filtered, filtering = timed(make, "prefilter")
             parameters = {"filtered": filtered, "maps": filtered.maps}
-            forward, gradient = functions(shade_prefiltered, "maps")
+            forward, gradient = functions(filtered_radiance, "maps")
             setting = f"tolerance {tolerance:g}"
             own = {"setup": seconds + filtering, "ours": True}
             methods.append(Method(f"shisd, filtered {degree}", setting, forward, parameters, gradient, **own))
@@ -300,7 +300,7 @@ def make_fits():
             table, seconds = timed(lambda brdf=brdf, count=count: lobes.fit_table(brdf, count), kind)
             arrays |= {f"{name}: {part}": getattr(table, part) for part in PARTS} | {f"{name}: seconds": seconds}
             print(f"{name} Gaussians: {seconds:.2f} s", flush=True)
-    io.write_atomically(FITTED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
+    write_atomically(FITTED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
 
 
 def shade_gaussians(parameters, normals, views):
@@ -355,7 +355,7 @@ def make_references():
             error = np.sqrt(np.mean((values[:16] - finer) ** 2) / np.mean(finer**2))
             arrays[f"{material}, {name}"], arrays[f"{material}, {name}: error"] = values, error
             print(f"{material}, {name}: RMS {np.sqrt(np.mean(values**2)):.4g}, error {error:.1e}", flush=True)
-    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
+    write_atomically(STORED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 literal: the equation as it stands, vmapped: SH at all rotated axes of all pixels, products per band.
 tiled: the same in tiles of 64 pixels, so that the stacked basis stays in the cache.
 tables: the light convolved with each band's zonal harmonic, tabulated over directions, looked up bilinearly.
-rotated: light turned to the local frame by constant matrices, `shading.shade_environment`.
+rotated: light turned to the local frame by constant matrices, `shading.shade` with a `DistantLight`.
 The first three interpolate weights linearly in elevation, as ISD15's shader does.
 """
 

@@ -3,11 +3,12 @@
 Scenes, float32, 16,384 points: a floor with slightly varied normals, views to 80 degrees from them, below a panel
 ("floor") or beside a screen that stands on it, from 0.1 of its height on ("wall").
 
-Families (kernels and their sources: `area_lights`): ours, `shade_polygon` with slices fitted above the horizon; Gauss
-points on the light; Monte Carlo by solid angle, by the material, by both, all with shifted lattices; linearly
-transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the light by Xu et al.'s rule; the
-light's harmonics, turned to the local frame; axial moments. Points and samples of a portal look the distant light up in
-a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the slices' degree.
+Families (kernels and their sources: `area_lights`): ours, `shade` with a `PolygonLight` or `PortalLight` and slices
+fitted above the horizon; Gauss points on the light; Monte Carlo by solid angle, by the material, by both, all with
+shifted lattices; linearly transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the
+light by Xu et al.'s rule; the light's harmonics, turned to the local frame; axial moments. Points and samples of a
+portal look the distant light up in a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the
+window at the slices' degree.
 Derivatives are measured in the full run, in one polygon task, as their cost depends on no numbers: of ours, points and
 samples of the light and transformed cosines; for projections of ours and of points. Those of points and samples are of
 the sum as it stands, without what happens where the light crosses the horizon, and by JAX's reverse mode, which XLA
@@ -32,7 +33,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import harmonics, io, models, reference, shading
+from shisd import harmonics, models, reference, shading
+from shisd.io.internal import write_atomically
 from tests.bench import area_lights, lobes, polygons
 from tests.bench.harness import Method, Task, run
 from tests.truth import scipy_basis, triangle_rule
@@ -79,13 +81,14 @@ def lanes(name: str):
 # ---- what is run
 
 
-def shade_polygon(parameters, quad, *rows):
-    return shading.shade_polygon(parameters, models.PolygonLight(quad), *rows)
+def lit_by_polygon(parameters, quad, positions, normals, views):
+    return shading.shade(parameters, models.PolygonLight(quad), shading.Surface(normals, views, positions))
 
 
-def shade_portal(parameters, quad, *rows):
+def lit_through_portal(parameters, quad, positions, normals, views):
     material, portal = parameters
-    return shading.shade_portal(material, eqx.tree_at(lambda p: p.points, portal, quad), *rows)
+    moved = eqx.tree_at(lambda p: p.points, portal, quad)
+    return shading.shade(material, moved, shading.Surface(normals, views, positions))
 
 
 @functools.cache
@@ -169,8 +172,8 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
 
     for degree in (4, 12) if quick else (4, 6, 8, 12, 20):
         table, seconds = fitted_slices(name, degree)
-        differentiated = shade_polygon if degree == 8 else None  # compiling a derivative takes 10 s
-        add("shisd", f"degree {degree}", shade_polygon, table, differentiated, setup=seconds, ours=True)
+        differentiated = lit_by_polygon if degree == 8 else None  # compiling a derivative takes 10 s
+        add("shisd", f"degree {degree}", lit_by_polygon, table, differentiated, setup=seconds, ours=True)
     for family, kernel, differentiable in (
         ("Gauss points", area_lights.gauss_points, True),
         ("Monte Carlo, solid angle", area_lights.by_solid_angle, True),
@@ -212,7 +215,7 @@ def portal_task(name: str, stored) -> Task:
         table, seconds = fitted_slices(name, degree)
         light, more = timed(models.PortalLight, QUADS["floor"], coefficients)
         parameters = table, light
-        own = Method("shisd", f"degree {degree}", shade_portal, parameters, setup=seconds + more, ours=True)
+        own = Method("shisd", f"degree {degree}", lit_through_portal, parameters, setup=seconds + more, ours=True)
         product, more = timed(functools.partial(harmonics.product_matrix, input_degree=degree), coefficients, degree)
         parameters, kernel = (area_lights.slices(table), product), shaded(area_lights.triple_products, degree, size=128)
         methods += [own, Method("SH triple product", f"degree {degree}", kernel, parameters, setup=seconds + more)]
@@ -325,7 +328,7 @@ def make() -> None:
 
     add("projection", coefficients(24), coefficients(18))
     FILE.parent.mkdir(exist_ok=True)
-    io.write_atomically(FILE, lambda file: np.savez_compressed(file, **stored), overwrite=True)
+    write_atomically(FILE, lambda file: np.savez_compressed(file, **stored), overwrite=True)
 
 
 def main() -> None:

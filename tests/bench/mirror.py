@@ -23,6 +23,7 @@ import numpy as np
 from examples._scene import camera_rays, hits, load_mesh, unit
 from shisd import harmonics, models, shading
 from shisd._numerics import normalize
+from shisd.harmonics.internal import sample_map
 from tests.bench.timing import interleaved
 
 DATA = Path(__file__).parents[2] / "examples" / "data"
@@ -90,7 +91,7 @@ def sampled(name: str, room: str, samples: int, filtered: bool = True) -> tuple[
     def picture(normals, positions, eye):
         views = normalize(eye[None] - positions)
         directions = 2 * jnp.sum(views * normals, axis=1, keepdims=True) * normals - views
-        looked = harmonics.sample_map(texels, directions, texels="samples")
+        looked = sample_map(texels, directions, texels="samples")
         light = jnp.zeros((*of.seen.shape, 3)).at[row, column].set(looked)
         if not filtered:
             return light
@@ -132,12 +133,13 @@ def methods(name: str, room: str, degrees: tuple[int, ...] = DEGREES) -> dict[st
         add(f"{samples} x {samples} samples", samples)
     for degree in degrees:
         for windowed, of_light in ((False, f"degree {degree}"), (True, f"degree {degree}, Hann")):
-            shade = functools.partial(shading.shade_mirror, light_coefficients=light(room, degree, windowed))
+            distant = models.DistantLight(light(room, degree, windowed))
+            shade = functools.partial(shading.reflect, light=distant)
             found[f"round, {of_light}"] = reflected(name, shade)
             if degree <= 60:
                 found[f"as it is, {of_light}"] = reflected(name, functools.partial(shade, anisotropic=True))
     maps = shading.MirrorMaps.from_texels(environment(room).texels)
-    found["filtered maps"] = reflected(name, functools.partial(shading.shade_prefiltered_mirror, maps=maps))
+    found["filtered maps"] = reflected(name, functools.partial(shading.reflect, light=maps))
     return found
 
 
@@ -188,17 +190,18 @@ def _costs() -> list[dict]:
     footprint, rows = shading.Footprint(directions, axes), []
     for degree in DEGREES:
         e = light("interior", degree)
+        distant = models.DistantLight(e)
         calls = {
-            "shade_mirror": lambda e=e: shading.reflect(footprint, models.DistantLight(e)),
+            "reflect": lambda distant=distant: shading.reflect(footprint, distant),
             "sh_basis and sum": jax.jit(lambda e=e, degree=degree: harmonics.sh_basis(directions, degree) @ e.T),
             "evaluate": lambda e=e: harmonics.evaluate(e[:, None], directions),
-            "anisotropic": lambda e=e: shading.reflect(footprint, models.DistantLight(e), anisotropic=True),
+            "anisotropic": lambda distant=distant: shading.reflect(footprint, distant, anisotropic=True),
         }
         times = {name: t.best / 8192 * 1e6 for name, t in interleaved(calls, seconds=0.5).items()}
         rows.append({
             "degree": degree,
             **{f"{name}, us": t for name, t in times.items()},
-            "over sh_basis": times["shade_mirror"] / times["sh_basis and sum"],
-            "over evaluate": times["shade_mirror"] / times["evaluate"],
+            "over sh_basis": times["reflect"] / times["sh_basis and sum"],
+            "over evaluate": times["reflect"] / times["evaluate"],
         })  # fmt: skip
     return rows

@@ -30,7 +30,8 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from shisd import io, models, shading
+from shisd import models, shading
+from shisd.io.internal import write_atomically
 from tests.bench import make_pictures
 from tests.bench.harness import Method, Task
 
@@ -186,7 +187,7 @@ def ours(name: str, degree: int, rays) -> Method:
     domain = "sphere" if name == "sphere" else "upper"
     start = time.perf_counter()
     material = shading.tabulate_brdf(models.Ggx(ALPHA), degree, domain=domain)
-    light = room().coefficients(degree) if name == "sphere" else models.PolygonLight(LAMP, EMISSION)
+    light = room().light(degree) if name == "sphere" else models.PolygonLight(LAMP, EMISSION)
     jax.block_until_ready((material, light))
     setup = time.perf_counter() - start
     shade = _shade_sphere if name == "sphere" else _shade_floor
@@ -199,9 +200,7 @@ def _shade_sphere(parameters):
     material, light, rays = parameters
     _, normals, views, hit = meet("sphere", rays)
     normals = jnp.where(hit[:, None], normals, views)
-    return jnp.where(
-        hit[:, None], shading.shade(material, models.DistantLight(light), shading.Surface(normals, views)), 0
-    )
+    return jnp.where(hit[:, None], shading.shade(material, light, shading.Surface(normals, views)), 0)
 
 
 def _shade_floor(parameters):
@@ -297,7 +296,7 @@ def main() -> None:
         stored |= {name: mean.astype(np.float32), f"{name} noise": noise}
         print(f"{name}: {len(mean)} pixels, {PASSES * PASS_SAMPLES} samples each, noise {noise:.2g}", flush=True)
     STORED.parent.mkdir(exist_ok=True)
-    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
+    write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
     print(f"{STORED.name}: {STORED.stat().st_size} bytes")
 
 

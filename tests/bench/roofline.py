@@ -55,7 +55,7 @@ def speeds() -> dict[str, float]:
 
 
 def environment_work(degree: int, colours: int) -> dict[str, float]:
-    """Of `shade_environment` for a pixel: spline, view azimuth, exchange of axes, series of the light."""
+    """Of `shade` with a `DistantLight` for a pixel: spline, view azimuth, exchange of axes, series of the light."""
     rows = len(_pairing.rows(degree)[0])
     exchange = sum(m.size for block in _pairing._blocks(degree) for m in block.swap)
     series = sum(m.size for m in _pairing.turned_series(jnp.zeros((3, (degree + 1) ** 2)), degree))
@@ -63,7 +63,7 @@ def environment_work(degree: int, colours: int) -> dict[str, float]:
 
 
 def polygon_work(degree: int, edges: int) -> dict[str, float]:
-    """Of `shade_polygon` for a pixel: spline, weights of the axes, and the recurrences along edges."""
+    """Of `shade` with a `PolygonLight` for a pixel: spline, weights of the axes, and the recurrences along edges."""
     rows = (degree + 1) * (degree + 2) // 2
     weights = sum(m.size for m in incidence_inverse(degree, np.dtype("float32"))[1])
     steps = (degree + 1) * (degree - 1)
@@ -92,18 +92,20 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     positions, normals, views = local_lights.points("wall")
     facing = np.sum(normals * views, axis=1, keepdims=True)
     views = np.where(facing > 0, views, views - 2 * facing * normals)
-    light = models.PolygonLight(local_lights.QUADS["wall"])
+    lamp = models.PolygonLight(local_lights.QUADS["wall"])
+    local = lambda m: shading.shade(m, lamp, shading.Surface(normals, views, positions))
     for degree in (8, 16, 30):
-        e = jnp.asarray(np.random.default_rng(1).normal(size=(3, (degree + 1) ** 2)), jnp.float32)
+        e = np.random.default_rng(1).normal(size=(3, (degree + 1) ** 2))
+        light = models.DistantLight(jnp.asarray(e, jnp.float32))
         fitted = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, elevations=VIEWS, domain="upper")
         one = shading.tabulate_brdf(models.Ggx(0.25, 0.04), degree, elevations=VIEWS)
-        rgb = shading.tabulate_brdf(models.Ggx(0.25, np.array([0.9, 0.6, 0.3])), degree, views=VIEWS)
-        shade = lambda m, e=e: functools.partial(shading.shade_environment, m, e, normals, views)
+        rgb = shading.tabulate_brdf(models.Ggx(0.25, np.array([0.9, 0.6, 0.3])), degree, elevations=VIEWS)
+        distant = lambda m, light=light: shading.shade(m, light, shading.Surface(normals, views))
         functions = {
-            "shade_environment, one colour": (shade(one), environment_work(degree, 1)),
-            "shade_environment, RGB material": (shade(rgb), environment_work(degree, 3)),
-            "shade_polygon, all lamps cut by the horizon": (
-                functools.partial(shading.shade_polygon, fitted, light, positions, normals, views),
+            "shade, DistantLight, one colour": (functools.partial(distant, one), environment_work(degree, 1)),
+            "shade, DistantLight, RGB material": (functools.partial(distant, rgb), environment_work(degree, 3)),
+            "shade, PolygonLight, all lamps cut by the horizon": (
+                functools.partial(local, fitted),
                 polygon_work(degree, 6),
             ),
             "sh_basis": (

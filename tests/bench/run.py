@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, domains, io, models, reference, shading
+from shisd import decomposition, domains, models, reference, shading
 from shisd.domains.moments import fold
 from shisd.harmonics import _tables
+from shisd.io.internal import write_atomically
 from tests.bench import conditioning, equation_22, lobes, native, planning, polygons, stability
 from tests.bench.timing import interleaved
 from tests.truth import zonal_moments
@@ -64,14 +65,9 @@ def bench_equation_22(degrees=(4, 8, 16, 30)):
                 "max error / max": float(np.max(np.abs(error)) / np.max(np.abs(truth))),
                 "first call s": times[name].first,
             })  # fmt: skip
-        gradient = jax.jit(
-            jax.grad(
-                lambda n, v, m=material, light=light: jnp.sum(
-                    shading.shade(m, models.DistantLight(light), shading.Surface(n, v))
-                ),
-                (0, 1),
-            )
-        )
+        distant = models.DistantLight(light)
+        shaded = lambda n, v, m=material, light=distant: shading.shade(m, light, shading.Surface(n, v))
+        gradient = jax.jit(jax.grad(lambda n, v, f=shaded: jnp.sum(f(n, v)), (0, 1)))
         forward = candidates["rotated"]
         times = interleaved({"gradient": gradient, "forward": forward}, normals[:count], views[:count])
         rows[-1]["value and gradient / forward"] = times["gradient"].median / times["forward"].median
@@ -91,9 +87,9 @@ def memory_child(degree):
     peak = lambda: int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**20
     normals = unit(rng.normal(size=(1024 * 768, 3))).astype(np.float32)
     material = shading.tabulate_brdf(models.Ggx(0.3), degree)
-    light = rng.normal(size=(3, (degree + 1) ** 2)).astype(np.float32)
+    light = models.DistantLight(rng.normal(size=(3, (degree + 1) ** 2)).astype(np.float32))
     before = peak()
-    jax.block_until_ready(shading.shade(material, models.DistantLight(light), shading.Surface(normals, normals)))
+    jax.block_until_ready(shading.shade(material, light, shading.Surface(normals, normals)))
     print(json.dumps({"peak GiB, whole process": peak(), "before shading": before}))
 
 
@@ -213,12 +209,12 @@ def bench_ridge(ridges=(1e-2, 1e-4, 1e-6, 1e-8, 1e-10), degree=8, count=64):
             exact = [x.astype(float) for x in (position, normal, view)]
             truth = np.asarray(reference.shade_polygon_quadrature(make(), quad, 1.0, *exact, nodes=48))
         for dtype in (np.float32, np.float64):
-            points = [x.astype(dtype) for x in (position, normal, view)]
             with jax.enable_x64(dtype == np.float64):
+                surface = shading.Surface(*(x.astype(dtype) for x in (normal, view, position)))
                 light = models.PolygonLight(quad.astype(dtype))
                 for row in rows:
                     material = shading.tabulate_brdf(make(), degree, domain="upper", ridge=row["ridge"])
-                    error = np.asarray(shading.shade_polygon(material, light, *points)) - truth
+                    error = np.asarray(shading.shade(material, light, surface)) - truth
                     row[f"{name}, {dtype.__name__}"] = float(np.sqrt(np.mean(error**2) / np.mean(truth**2)))
     return rows
 
@@ -244,7 +240,7 @@ def cost_figure(rows, path):
     axes.set(xlabel="coefficients $(L+1)^2$", ylabel="us per triangle", title="Cost of one integral over a triangle")
     axes.legend()
     figure.tight_layout()
-    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=120), overwrite=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=120), overwrite=True)
     pyplot.close(figure)
 
 
@@ -300,7 +296,7 @@ def paste(name, text):
     page, start = DOCS / "benchmarks.md", f"<!-- table:{name} -->"
     before, rest = page.read_text().split(start)
     rest = rest.split("<!-- /table -->", 1)[1]
-    io.write_atomically(page, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
+    write_atomically(page, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
 
 
 def main():
@@ -330,8 +326,8 @@ def main():
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
-    io.write_atomically(arguments.output / "bench.json", json.dumps(results, indent=1), overwrite=True)
-    io.write_atomically(arguments.output / "bench.md", "\n\n".join([*sections.values(), note]) + "\n", overwrite=True)
+    write_atomically(arguments.output / "bench.json", json.dumps(results, indent=1), overwrite=True)
+    write_atomically(arguments.output / "bench.md", "\n\n".join([*sections.values(), note]) + "\n", overwrite=True)
     for marker, names in PAGES.items() if arguments.pages else ():
         if all(name in sections for name in names):
             paste(marker, "\n\n".join([*(sections[name] for name in names), note]))

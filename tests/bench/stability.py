@@ -346,8 +346,8 @@ def shading_rows():
     for dtype in FLOATS:
         with jax.enable_x64(dtype == np.float64):
             material = tabulated(brdf, dtype, domain="upper")
-            shade = lambda points, *surface, material=material: shading.shade_polygon(
-                material, models.PolygonLight(points), *surface
+            shade = lambda points, positions, normals, views, material=material: shading.shade(
+                material, models.PolygonLight(points), shading.Surface(normals, views, positions)
             )
             stacked = [jnp.asarray(np.stack(x), dtype) for x in zip(*scenes.values(), strict=True)]
             got, slopes = jax.jit(jax.vmap(jax.value_and_grad(shade, (0, 1, 2, 3))))(*stacked)
@@ -406,9 +406,8 @@ def roughness_rows():
             @jax.jit
             @functools.partial(jax.value_and_grad, argnums=(0, 1, 2))
             def radiance(alpha, normal, view, e):
-                return shading.shade(
-                    tabulated(models.Ggx(alpha, 0.04), e.dtype), models.DistantLight(e), shading.Surface(normal, view)
-                )
+                slices = tabulated(models.Ggx(alpha, 0.04), e.dtype)
+                return shading.shade(slices, models.DistantLight(e), shading.Surface(normal, view))
 
             distant = models.Environment.from_function(lambda w: jnp.asarray(light(np.asarray(w, float)), w.dtype), 256)
             for name, (alpha, view) in cases.items():

@@ -20,7 +20,7 @@ from examples import _scene
 from shisd import harmonics, models, reference, shading
 from shisd.harmonics import _tables
 from shisd.harmonics._rotation import rotate_many
-from shisd.shading._surface import frame
+from shisd.shading._frames import frame
 from shisd.shading.slices._slices import lookup_table, slice_values
 from tests.bench.timing import interleaved
 
@@ -69,7 +69,8 @@ def tables(quick: bool) -> dict[str, list[dict]]:
     shape, view, starts, visible = rabbit(48 if quick else 80)
     see = lambda degree: models.Visibility.from_mesh(shape.vertices, shape.faces, degree, rays=2048)
     fine, seen = see(FINE), {degree: see(degree) for degree in (DEGREES[1:3] if quick else DEGREES)}
-    where = {"triangle": view.triangle, "weights": view.weights}
+    surface = lambda: shading.Surface(view.normals, view.views, triangles=view.triangle, barycentric=view.weights)
+    shaded = lambda material, light: shading.shade(material, light, surface())
     rows = []
     for map_name, file in (("interior", "interior.hdr"), ("studio", "studio.exr"))[: 1 if quick else 2]:
         light = environment(file)
@@ -82,24 +83,21 @@ def tables(quick: bool) -> dict[str, list[dict]]:
             truth = trace(256 if quick else 1024, 0)
             noise2 = float(np.mean(np.asarray(truth.standard_error, float) ** 2))
             rms = float(np.sqrt(np.mean(np.asarray(truth.value, float) ** 2)))
-            e = {degree: light.coefficients(degree + OF_SLICES) for degree in (0, *seen, FINE)}
-            shaded = {
-                ("no occlusion", ""): lambda material=material, e=e: shading.shade(
-                    material, models.DistantLight(e[0]), shading.Surface(view.normals, view.views)
-                ),
+            distant = {degree: light.light(degree + OF_SLICES) for degree in (0, *seen, FINE)}
+            hidden = {degree: models.Occluded(distant[degree], v) for degree, v in seen.items()}
+            methods = {
+                ("no occlusion", ""): functools.partial(shaded, material, distant[0]),
                 **{
-                    ("visibility", f"degree {degree}"): functools.partial(
-                        shading.shade_environment_visibility, material, e[degree], v, view.normals, view.views, **where
-                    )
-                    for degree, v in seen.items()
+                    ("visibility", f"degree {degree}"): functools.partial(shaded, material, own)
+                    for degree, own in hidden.items()
                 },
                 ("ray casting", "64 rays"): lambda trace=trace: trace(64, 1).value,
             }
-            times = interleaved(shaded, seconds=0.2)
-            for (method, setting), function in shaded.items():
+            times = interleaved(methods, seconds=0.2)
+            for (method, setting), function in methods.items():
                 excess = np.mean((np.asarray(function(), float) - np.asarray(truth.value, float)) ** 2) - noise2
                 expected = method.startswith("visibility") and predicted(
-                    material, e[FINE], fine, view, int(setting.split()[1])
+                    material, distant[FINE].coefficients, fine, view, int(setting.split()[1])
                 )
                 rows.append({
                     "map": map_name,
