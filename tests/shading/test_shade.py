@@ -117,6 +117,7 @@ def test_a_prepared_material_has_the_slices_of_tabulate_brdf(kind):
     same(equal.distant, sphere)
     same(equal.local, upper)
     same(more.distant, sphere.cut(2))
+    np.testing.assert_array_equal(more.distant.coefficients, sphere.coefficients[..., :9])
     same(more.local, upper)
     same(less.distant, sphere)
     same(less.local, sphere.cut(1).above_horizon())
