@@ -120,7 +120,7 @@ class Visibility(Module):
         without a normal (of no triangle, only of triangles without area, or of triangles that cancel), with their
         number; ImportError without the package.
         Accuracy: `noise`, wherever the mesh is and whatever its unit, as far as its coordinates are exact.
-        Not differentiable: for gradients see the derivative of `shade_environment_visibility` in the coefficients.
+        Not differentiable: for gradients see the derivative of `shading.shade` in the coefficients.
         Cost: V x rays rays.
         """
         degree, rays = _checks.degree(degree), _checks.integer("rays", rays, minimum=2)
