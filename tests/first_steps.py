@@ -23,10 +23,10 @@ LIGHT = np.linspace(1, -1, (DEGREE + 1) ** 2, dtype=np.float32)
 
 def radiance(roughness):
     """What two points send back of distant light and of a lamp, and their sum."""
-    lobes = shading.tabulate_brdf(models.Ggx(roughness), DEGREE)
+    slices = shading.tabulate_brdf(models.Ggx(roughness), DEGREE)
     lamp = models.PolygonLight(LAMP, two_sided=True)
-    distant = shading.shade(lobes, models.DistantLight(LIGHT), shading.Surface(NORMALS, VIEWS))
-    near = shading.shade(lobes, lamp, shading.Surface(NORMALS, VIEWS, np.zeros_like(NORMALS)))
+    distant = shading.shade(slices, models.DistantLight(LIGHT), shading.Surface(NORMALS, VIEWS))
+    near = shading.shade(slices, lamp, shading.Surface(NORMALS, VIEWS, np.zeros_like(NORMALS)))
     return (distant + near).sum(), {"distant": distant, "near": near}
 
 
