@@ -165,7 +165,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     writer = csv.writer(text)
     writer.writerow(["parameter", "truth", "found", "error %", *(f"noisy {k}" for k in range(len(rows[0].noisy)))])
     writer.writerows([r.parameter, r.truth, r.found, r.error, *r.noisy] for r in rows)
-    io.write_atomically(path, text.getvalue(), overwrite=True)
+    _scene.save(path, text.getvalue())
 
 
 def sheet(
@@ -204,7 +204,5 @@ def sheet(
         axes.grid(color=ink, alpha=0.15, linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=7.5, loc="center left", bbox_to_anchor=(1, 0.5), labelcolor=ink)
-        io.write_atomically(
-            path, lambda file: figure.savefig(file, format="png", dpi=120, facecolor=paper), overwrite=True
-        )
+        _scene.save(path, lambda file: figure.savefig(file, format="png", dpi=120, facecolor=paper))
         pyplot.close(figure)

@@ -3,13 +3,14 @@
 import argparse
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
-from shisd import io, models, plotting, shading
+from shisd import models, plotting, shading
 
 try:
     from tqdm import tqdm
@@ -107,7 +108,15 @@ def prepare_output(folder: Path, overwrite: bool, name: str, parser: argparse.Ar
         if not folder.is_dir() or not (mark.is_file() or not any(folder.iterdir())):
             parser.error(f"{folder} was not made by this program and is left alone. Name another --output.")
     folder.mkdir(parents=True, exist_ok=True)
-    io.write_atomically(mark, f"Files here may be replaced by {name}.py --overwrite.\n", overwrite=True)
+    save(mark, f"Files here may be replaced by {name}.py --overwrite.\n")
+
+
+def save(path: Path, content: str | Callable[[IO[bytes]], object]) -> None:
+    """Put a text, or what a function writes to a binary file, in the place of what is there, whole or not at all."""
+    beside = path.with_name(f".{path.name}.part")
+    with beside.open("wb") as file:
+        file.write(content.encode()) if isinstance(content, str) else content(file)
+    beside.replace(path)
 
 
 def verdict(reached: str, start: float, output: Path) -> None:
@@ -229,7 +238,6 @@ def sheet(
     limits: tuple[float, float] | None = None,
     notes: dict[tuple[int, int], str] | None = None,
     title: str = "",
-    overwrite: bool = True,
 ) -> None:
     """A grid of pictures of one shape, pixel by pixel, with titles of columns, labels of rows [(label, pictures)].
 
@@ -266,9 +274,7 @@ def sheet(
         if limits:
             colour_scale(figure, (*at(size[0] - 248, size[1] - 22), 220 / size[0], 10 / size[1]), limits)
             figure.text(*at(size[0] - 274, size[1] - 27), "error / mean radiance", ha="right", va="center", fontsize=8)
-        io.write_atomically(
-            path, lambda file: figure.savefig(file, format="png", dpi=dpi, facecolor=PAPER), overwrite=overwrite
-        )
+        save(path, lambda file: figure.savefig(file, format="png", dpi=dpi, facecolor=PAPER))
         pyplot.close(figure)
 
 

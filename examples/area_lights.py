@@ -189,7 +189,7 @@ def main(arguments: list[str] | None = None) -> None:
     start = time.perf_counter()
     rows = run(options.output, options.size, options.nodes)
     text = table(rows, options.nodes)
-    io.write_atomically(options.output / "area_lights.md", text + "\n", overwrite=True)
+    _scene.save(options.output / "area_lights.md", text + "\n")
     print(text)
     check(rows)
     worst = {part: max(r["error"] for r in rows if r["surface"] == part) for part in DEGREES}

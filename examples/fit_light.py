@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import io, models, shading
+from shisd import models, shading
 
 LIGHT_DEGREE = 3
 DEGREE = 12  # of the slices over the lamp: with 16, the picture moves by less than its noise
@@ -154,7 +154,7 @@ def main(arguments: list[str] | None = None) -> None:
         rows = run(options.output, options.size, options.steps, options.noisy)
     _fit.write_csv(options.output / "fit_light.csv", rows)
     text = table(rows)
-    io.write_atomically(options.output / "fit_light.md", text + "\n", overwrite=True)
+    _scene.save(options.output / "fit_light.md", text + "\n")
     print(text)
     assert rows[0].error < 1, f"the lamp is {rows[0].error:.2g} % of its distance from its place"
     others = max(row.error for row in rows[4:])

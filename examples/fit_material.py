@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import io, models, shading
+from shisd import models, shading
 
 NAMES = "alpha along x", "alpha along y", "albedo, red", "albedo, green", "albedo, blue", "specular"
 START = 0.7, 0.7, 0.2, 0.2, 0.2, 0.1
@@ -130,7 +130,7 @@ def main(arguments: list[str] | None = None) -> None:
     rows, report = run(options.output, options.size, options.degree, options.steps, options.noisy)
     _fit.write_csv(options.output / "fit_material.csv", rows)
     text = table(rows, options.degree)
-    io.write_atomically(options.output / "fit_material.md", text + "\n", overwrite=True)
+    _scene.save(options.output / "fit_material.md", text + "\n")
     print(text)
     for row in rows:
         assert row.error < 2, f"{row.parameter}: {row.error:.2g} % from the truth"

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from shisd import io, models, shading
+from shisd import models, shading
 
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 TOLERANCE = {"radiance": 1e-6, "light": 1e-5, "normals": 1e-5}  # rounding, relative to the largest
@@ -235,7 +235,7 @@ def main(arguments: list[str] | None = None) -> None:
     start = time.perf_counter()
     rows = run(options.degree, options.pixels, options.devices, options.processes)
     text = table(rows, options.degree, options.pixels)
-    io.write_atomically(options.output / "many_devices.md", text + "\n", overwrite=True)
+    _scene.save(options.output / "many_devices.md", text + "\n")
     print(text)
     check(rows)
     worst = max(row[f"{name} difference"] for row in rows for name in TOLERANCE)

@@ -91,7 +91,7 @@ def main() -> None:
     _scene.prepare_output(options.output, options.overwrite, "mirror", parser)
     start = time.perf_counter()
     rows = run(options.output, options.size)
-    io.write_atomically(options.output / "mirror.md", table(rows) + "\n", overwrite=True)
+    _scene.save(options.output / "mirror.md", table(rows) + "\n")
     print(table(rows))
     median = {method: max(r["median"] for r in rows if r["method"] == method) for method in (FILTERED, "1 sample")}
     reached = f"Median error within {100 * median[FILTERED]:.2g} % of {MANY} x {MANY} rays by filtered maps"

@@ -92,7 +92,7 @@ def main() -> None:
     _scene.prepare_output(options.output, options.overwrite, "visibility", parser)
     start = time.perf_counter()
     rows = run(options.output, options.size, options.samples, options.rays, options.seed)
-    io.write_atomically(options.output / "visibility.md", table(rows) + "\n", overwrite=True)
+    _scene.save(options.output / "visibility.md", table(rows) + "\n")
     print(table(rows))
     check(rows)
     worst = max(r["error"] for r in rows if r["method"].endswith(f" {SEEN[-1]}"))

@@ -11,6 +11,7 @@ from shisd import io as io
 from shisd import models as models
 from shisd import planning as planning
 from shisd import shading as shading
+from shisd._status import Status as Status
 
 if TYPE_CHECKING:
     from shisd import plotting as plotting

@@ -113,4 +113,4 @@ def test_sphinx_builds_the_pages_without_a_warning(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     shading = (tmp_path / "html/api/shading.html").read_text()
-    assert 'id="shisd.shading.shade_environment"' in shading and "jaxlib" not in shading
+    assert 'id="shisd.shading.shade"' in shading and "jaxlib" not in shading

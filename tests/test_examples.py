@@ -23,7 +23,7 @@ def verdict(done, output):
     """The last line: the name of what was reached, its number, the seconds, and where to look."""
     assert done.returncode == 0, done.stdout + done.stderr
     last = done.stdout.splitlines()[-1]
-    assert re.fullmatch(rf"[A-Z][a-z ]+ (within|agree) .*\d.*, in [\d.]+ s; see {re.escape(str(output))}/\.", last), (
+    assert re.fullmatch(rf"[A-Z][a-z]+ .*(within|agree) .*\d.*, in [\d.]+ s; see {re.escape(str(output))}/\.", last), (
         last
     )
     return last

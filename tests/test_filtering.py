@@ -9,13 +9,14 @@ import pytest
 from jax.test_util import check_grads
 from scipy.special import ive
 
-from shisd import filtering, io, models
+from shisd import Status, filtering, io, models
+from shisd.io.internal import merl_above_horizon
 from tests.marks import FLOAT32_FIRST
 from tests.models.materials import GOLD_PAINT, albedos, array, evaluate, hemisphere, pairs, spherical, spoiled
 from tests.truth import scipy_basis
 
 OK, UNCOVERED, STEP_LIMIT = (
-    filtering.FitStatus.ok, filtering.FitStatus.uncovered, filtering.FitStatus.step_limit,
+    Status.ok, Status.uncovered, Status.step_limit,
 )  # fmt: skip
 N = 1500
 ELEVATIONS = (0.0, 0.5, 1.0, 1.3)
@@ -84,7 +85,7 @@ def test_partial_coverage_is_told(rng):
     wi, wo = (array(cosine_spread(rng, N), np.float32) for _ in range(2))
     y = jnp.ones((N, 3), np.float32)
     cut = jnp.where(((wi[:, 2] > 0.8) & (wo[:, 2] > 0.8))[:, None], y, -1)
-    found, partial = (filtering.fit_brdf(wi, wo, y, 3, isotropic=True) for y in (y, cut))
+    found, partial = (filtering.fit_brdf(wi, wo, y, 3, isotropic=True, throw=False) for y in (y, cut))
     assert found.status == OK and float(found.coverage) > 0.95
     assert partial.status == UNCOVERED and float(partial.coverage) < 0.7
     across = evaluate(partial.brdf, *(array(hemisphere(rng, N), np.float32) for _ in range(2)))
@@ -95,7 +96,9 @@ def test_partial_coverage_is_told(rng):
 def test_too_few_steps_are_told(rng):
     wi, wo = (array(cosine_spread(rng, N), np.float32) for _ in range(2))
     bumpy = evaluate(models.Ggx(0.3), wi, wo)
-    assert filtering.fit_brdf(wi, wo, bumpy, 4, isotropic=True, max_steps=1).status == STEP_LIMIT
+    assert filtering.fit_brdf(wi, wo, bumpy, 4, isotropic=True, max_steps=1, throw=False).status == STEP_LIMIT
+    with pytest.raises(ValueError, match="Raise `max_steps`"):
+        filtering.fit_brdf(wi, wo, bumpy, 4, isotropic=True, max_steps=1)
 
 
 @pytest.mark.slow
@@ -201,7 +204,7 @@ def test_errors_say_what_to_pass(as_user):
 def check_denoised(brdf, path, rng, smoothness):
     """Three times less RMS error than the noise, albedo to 1 %, reciprocity to 1e-12."""
     io.write_merl(path, brdf)
-    clean, above = io.read_merl(path), io.merl_above_horizon()
+    clean, above = io.read_merl(path), merl_above_horizon()
     io.write_merl(path, spoiled(clean, rng), overwrite=True)
     noisy = io.read_merl(path)
     seen = above & np.all(noisy >= 0, axis=-1)

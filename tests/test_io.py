@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from shisd import io, models
+from shisd.io.internal import merl_above_horizon, read_npz, write_atomically
 
 
 def write_exr(path, image, compression="ZIP_COMPRESSION"):
@@ -450,7 +451,7 @@ def test_merl_files_are_written_by_the_book(tmp_path, rng):
         offset = 12 + 8 * (p + 180 * (d + 90 * (h + 90 * c)))
         assert struct.unpack_from("<d", content, offset)[0] * scale[c] == pytest.approx(table[h, d, p, c])
     got = io.read_merl(path)
-    above = io.merl_above_horizon()
+    above = merl_above_horizon()
     assert np.all(got[~above] < 0) and got[3, 4, 5, 1] < 0
     above[3, 4, 5] = False
     np.testing.assert_allclose(got[above], table[above], rtol=1e-14)
@@ -459,8 +460,8 @@ def test_merl_files_are_written_by_the_book(tmp_path, rng):
 def test_a_scalar_brdf_fills_three_equal_planes(tmp_path):
     io.write_merl(tmp_path / "grey.binary", models.Lambertian(0.5))
     table = io.read_merl(tmp_path / "grey.binary")
-    np.testing.assert_allclose(table[io.merl_above_horizon()], 0.5 / np.pi, rtol=1e-6)
-    assert 0.5 < np.mean(io.merl_above_horizon()) < 0.9
+    np.testing.assert_allclose(table[merl_above_horizon()], 0.5 / np.pi, rtol=1e-6)
+    assert 0.5 < np.mean(merl_above_horizon()) < 0.9
 
 
 def test_what_a_merl_file_cannot_hold_is_refused(tmp_path, as_user):
@@ -519,7 +520,7 @@ def test_one_of_several_writers_succeeds(tmp_path, monkeypatch, links):
             ready.wait()
 
         try:
-            io.write_atomically(path, content)
+            write_atomically(path, content)
             results.append(i)
         except FileExistsError as error:
             assert "a.bin exists; pass overwrite=True" in str(error)
@@ -539,18 +540,18 @@ def test_links_folders_and_modes(tmp_path):
     path, target = tmp_path / "link", tmp_path / "target"
     path.symlink_to(target)
     with pytest.raises(FileExistsError, match="link exists; pass overwrite=True"):
-        io.write_atomically(path, write)
+        write_atomically(path, write)
     assert path.is_symlink() and not target.exists()
-    io.write_atomically(path, write, overwrite=True)
+    write_atomically(path, write, overwrite=True)
     assert path.read_bytes() == b"new" and not path.is_symlink() and not target.exists()
     path.chmod(0o640)
-    io.write_atomically(path, write, overwrite=True)
+    write_atomically(path, write, overwrite=True)
     assert path.stat().st_mode & 0o777 == 0o640
     (tmp_path / "folder").mkdir()
     with pytest.raises(ValueError, match="folder: a folder, pipe or device; name a file"):
-        io.write_atomically(tmp_path / "folder", write, overwrite=True)
+        write_atomically(tmp_path / "folder", write, overwrite=True)
     with pytest.raises(FileNotFoundError, match=r"No such file or directory.*none/a.bin"):
-        io.write_atomically(tmp_path / "none" / "a.bin", write)
+        write_atomically(tmp_path / "none" / "a.bin", write)
 
 
 def test_files_that_promise_more_than_they_hold(tmp_path):
@@ -564,17 +565,17 @@ def test_files_that_promise_more_than_they_hold(tmp_path):
             archive.writestr("a.npy", b"\x93NUMPY\x01\x00v\x00" + text.encode() + bytes(16))
 
     npz(tmp_path / "a.npz", "(2, 2)")
-    (array,) = io.read_npz(tmp_path / "a.npz", ["a"])
+    (array,) = read_npz(tmp_path / "a.npz", ["a"])
     np.testing.assert_array_equal(array, np.zeros((2, 2), np.float32))
     for shape in ("(1000000, 1000000)", "(2, 3)", "(2,)"):
         npz(tmp_path / "a.npz", shape)
         with pytest.raises(ValueError, match="a is not of the size that its header promises, float32"):
-            io.read_npz(tmp_path / "a.npz", ["a"])
+            read_npz(tmp_path / "a.npz", ["a"])
     pickled = stream.BytesIO()
     np.savez(pickled, a=np.array([{}], object))
     (tmp_path / "a.npz").write_bytes(pickled.getvalue())
     with pytest.raises(ValueError, match="a is not of the size"):
-        io.read_npz(tmp_path / "a.npz", ["a"])
+        read_npz(tmp_path / "a.npz", ["a"])
 
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"

@@ -1,9 +1,12 @@
 """What one meets at the prompt: names after `import shisd`, signatures in help texts, printed objects."""
 
+import ast
+import importlib
 import inspect
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -66,6 +69,34 @@ def test_objects_show_their_numbers():
     assert inside(seen).shape == (6,)
 
 
-@pytest.mark.parametrize("status", [decomposition.FitStatus, filtering.FitStatus, harmonics.WindowStatus])
-def test_a_good_status_says_so(status):
-    assert re.fullmatch(r"shisd\.[\w.]+<[A-Z].+\.>", repr(status.ok))
+def test_a_good_status_says_so():
+    assert re.fullmatch(r"shisd\.[\w.]+<[A-Z].+\.>", repr(shisd.Status.ok))
+
+
+MOST = 100
+
+
+def names_of(module) -> list[str]:
+    """What the `__init__.py` of a package gives anew, or a file defines."""
+    tree = ast.parse(inspect.getsource(module))
+    if hasattr(module, "__path__"):
+        return [a.asname or a.name for n in tree.body if isinstance(n, ast.ImportFrom) for a in n.names]
+    own = [n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef)]
+    return [name for name in own if name[0] != "_"]
+
+
+def test_there_are_few_enough_names_to_learn():
+    folder = Path(shisd.__file__).parent
+    places = sorted({p.stem for p in folder.glob("*.py")} | {p.parent.name for p in folder.glob("*/__init__.py")})
+    given = {s: names_of(importlib.import_module(f"shisd.{s}")) for s in places if s[0] != "_"}
+    given["shisd"] = ["Status"]
+    total = sum(len(names) for names in given.values())
+    listed = "\n".join(f"{stage} {len(names)}: {', '.join(names)}" for stage, names in given.items())
+    assert total <= MOST, f"{total} names, more than {MOST}:\n{listed}"
+
+
+def test_what_stages_give_is_only_what_they_list():
+    for stage in (*STAGES, shisd.io):
+        public = {name for name in vars(stage) if name[0] != "_"}
+        inner = {path.stem for path in Path(stage.__file__).parent.iterdir()}
+        assert public - inner - set(names_of(stage)) <= {"jaxtyping"}, stage.__name__  # put there by checks of tests

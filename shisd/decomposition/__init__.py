@@ -5,27 +5,18 @@ the mother kernels phi_l(w . z_k) of an `IsotropicBasis`. Few lobes with axes of
 """
 
 from shisd.decomposition._basis import RotatedZonalBasis as RotatedZonalBasis
-from shisd.decomposition._directions import conditioning_loss as conditioning_loss
 from shisd.decomposition._directions import fibonacci_directions as fibonacci_directions
-from shisd.decomposition._directions import low_discrepancy_directions as low_discrepancy_directions
 from shisd.decomposition._directions import optimize_directions as optimize_directions
 from shisd.decomposition._directions import optimized_directions as optimized_directions
-from shisd.decomposition._directions import random_directions as random_directions
 from shisd.decomposition._directions import separate_directions as separate_directions
-from shisd.decomposition._fit import FitStatus as FitStatus
-from shisd.decomposition._fit import LobeFit as LobeFit
 from shisd.decomposition._fit import fit_lobes as fit_lobes
-from shisd.decomposition._fit import lobe_starts as lobe_starts
-from shisd.decomposition._isotropic import Decomposition as Decomposition
 from shisd.decomposition._isotropic import IsotropicBasis as IsotropicBasis
-from shisd.decomposition._kernels import AbstractKernel as AbstractKernel
 from shisd.decomposition._kernels import CapKernel as CapKernel
 from shisd.decomposition._kernels import FunctionKernel as FunctionKernel
 from shisd.decomposition._kernels import GaussianKernel as GaussianKernel
 from shisd.decomposition._kernels import GaussLegendreKernel as GaussLegendreKernel
 from shisd.decomposition._kernels import LegendreKernel as LegendreKernel
 from shisd.decomposition._kernels import PhongKernel as PhongKernel
-from shisd.decomposition._kernels import VonMisesFisherKernel as VonMisesFisherKernel
 from shisd.decomposition._mixtures import GaussianLobes as GaussianLobes
 from shisd.decomposition._mixtures import ZonalLobes as ZonalLobes
 from shisd.decomposition._sparse import sparse_weights as sparse_weights

@@ -23,7 +23,7 @@ from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import normalize, same_dtype
 from shisd._sharding import by_device
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, ArrayLike, Bool, Float
 from shisd.decomposition._directions import check_count
 from shisd.harmonics import sh_basis
 
@@ -124,8 +124,8 @@ class RotatedZonalBasis(Module):
 
 @eqx.filter_jit
 def _weights(batch: dict[str, Array], basis: RotatedZonalBasis) -> Float[Array, "*batch l k"]:
-    weights = weights_by_band(basis._matrices(), batch["coefficients"], basis.degree)
-    return used_only(weights, basis.nested)
+    weights, bad = weights_by_band(basis._matrices(), batch["coefficients"], basis.degree)
+    return used_only(refused(weights, bad, basis.degree), basis.nested)
 
 
 @eqx.filter_jit
@@ -137,11 +137,16 @@ def _condition_numbers(basis: RotatedZonalBasis) -> Float[Array, " l"]:
 
 def weights_by_band(
     m: Float[Array, "bands n K"], c: Float[Array, "*batch coefs"], degree: int, ridge: float = 0.0
-) -> Float[Array, "*batch bands K"]:
-    """Weights of least norm for matrices M_l that are stacked and padded as `padding` says."""
+) -> tuple[Float[Array, "*batch bands K"], Bool[Array, " bands"]]:
+    """Weights of least norm for matrices M_l, stacked and padded as `padding` says, and which bands are bad."""
+    weights, bad = minimum_norm(m, by_band(c, degree), padding(degree)[1], ridge)
+    return jnp.moveaxis(weights, -1, 0).reshape(*c.shape[:-1], *weights.shape[:-1]), bad
+
+
+def refused(weights: Array, bad: Bool[Array, " bands"], degree: int) -> Array:
+    """`weights`, or an error at run time that names a band which the axes do not resolve."""
     messages = [_unresolved(l) for l in range(degree + 1)]
-    weights = minimum_norm(m, by_band(c, degree), padding(degree)[1], messages, ridge)
-    return jnp.moveaxis(weights, -1, 0).reshape(*c.shape[:-1], *weights.shape[:-1])
+    return eqx.branched_error_if(weights, jnp.any(bad), jnp.argmax(bad), messages)
 
 
 def by_band(c: Float[Array, "*batch coefs"], degree: int) -> Float[Array, "bands n columns"]:
@@ -154,14 +159,12 @@ def minimum_norm(
     m: Float[Array, "bands n K"],
     c: Float[Array, "bands n batch"],
     mask: np.ndarray,
-    unresolved: list[str],
     ridge: float = 0.0,
-) -> Float[Array, "bands K batch"]:
+) -> tuple[Float[Array, "bands K batch"], Bool[Array, " bands"]]:
     """x of least norm with m x = c in every band, for right-hand sides that are zero outside `mask` [bands, n].
 
-    With `ridge`, x minimises |m x - c|^2 + ridge s |x|^2, s = the mean eigenvalue of m m^T. Where the condition number
-    exceeds eps^(-1/2), eps the rounding of m, the message `unresolved` of that band is an error. The result has the
-    dtype that m and c promote to.
+    With `ridge`, x minimises |m x - c|^2 + ridge s |x|^2, s = the mean eigenvalue of m m^T. Bad are the bands whose
+    condition number exceeds eps^(-1/2), eps the rounding of m. The result has the dtype that m and c promote to.
 
     notation: q r = (m^T, sqrt(ridge s) 1), q_1 = the rows of q beside m^T, x = q_1 r^-T c. Padding columns of m^T have
     a one in a row of their own, which keeps full rank, as derivatives of QR need, and leaves the columns in use alone.
@@ -185,9 +188,8 @@ def minimum_norm(
     norm = lambda a: jnp.sqrt(jnp.sum(jnp.where(mask[:, None, :] & mask[:, :, None], a * a, 0), axis=(1, 2)))
     condition = norm(r) * norm(r_inverse) / jnp.asarray(mask.sum(axis=1), dtype=r.dtype)
     bad = ~(jax.lax.stop_gradient(condition) <= eps**-0.5)
-    c = eqx.branched_error_if(c, jnp.any(bad), jnp.argmax(bad), unresolved)
     solution = jax.lax.map(lambda a: solve_triangular(*a, trans="T"), (r, c))
-    return jnp.matmul(q[:, : m.shape[-1]], solution, precision="highest")
+    return jnp.matmul(q[:, : m.shape[-1]], solution, precision="highest"), bad
 
 
 def _unresolved(l: int) -> str:

@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._status import Status, settled
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.harmonics import legendre
 
 TABLE_DEGREE = 64
@@ -134,23 +134,26 @@ def optimize_directions(
     mirror: Literal["x", "y", "z"] | None = None,
     powers: Sequence[float] = (1.0, 3.0, 8.0),
     max_steps: int = 256,
+    throw: bool = True,
     progress: Progress = None,
 ) -> Float[Array, "K 3"]:
     """`directions` moved to lower the worst condition number of bands 0 ... `degree`.
 
-    BFGS on `conditioning_loss`, its power raised through `powers`: low powers spread all axes, high ones work on the
-    worst band. Finds a local minimum that depends on the start; deterministic.
+    BFGS on a smooth bound on the logarithm of that number, of a power raised through `powers`: low ones spread all
+    axes, high ones work on the worst band. Finds a local minimum that depends on the start; deterministic.
 
     Arguments: `directions` [K, 3], the start, nonzero, or several starts [S, K, 3], of which the best result is
-    returned; static `degree` L, with K >= 2L+1; static `nested` and `bands` as in `conditioning_loss`; at most
-    `max_steps` steps per power. Static `mirror`: keep the set closed under reflection at the plane "x" = 0, "y" = 0 or
+    returned; static `degree` L, with K >= 2L+1; static `nested`: band l has only the first 2l+1 axes; static
+    `bands`: those that count, by default 0 ... L (for axes that serve band l alone, bands=(l,)); at most `max_steps`
+    steps per power. Static `mirror`: keep the set closed under reflection at the plane "x" = 0, "y" = 0 or
     "z" = 0: its first axis lies in the plane, and 2i is the image of 2i - 1 (K must be odd); the start gives the axes
     1, 3, 5, ... A set closed under reflection at "y" has weights that come in pairs for isotropic materials seen along
     x. Axes are antipodal in themselves: z and -z are one. `progress`: None, True for a bar of tqdm, or a function of
     powers that are done and in all, over all starts.
     Returns unit vectors [K, 3] in the same order, hemispheres not restored. Work in float64 for the last digits.
-    A singular start, whose loss is not finite, comes back as it is: the basis refuses it with a clear message.
-    Derivatives: none are meant; differentiate `conditioning_loss`.
+    Where every start is singular, it is an error (`shisd.Status.ill_conditioned`); with `throw=False` the first comes
+    back as it is, and the basis refuses it.
+    Derivatives: none are meant; differentiate `RotatedZonalBasis.condition_numbers`.
     Cost: at each step the eigenvalues of a K x K matrix for every band; `make bench` reports the time.
     """
     starts = _checks.vectors("directions", directions)
@@ -176,8 +179,10 @@ def optimize_directions(
                 step()
             found.append(z)
             losses.append(loss)
-    best = jnp.stack(found)[jnp.nanargmin(jnp.stack(losses))]
-    return normalize(best if plane is None else _mirrored(best, plane))
+    least = jnp.stack(losses)
+    best = jnp.stack(found)[jnp.nanargmin(least)]
+    status = Status.where(jnp.any(jnp.isfinite(least)), Status.ok, Status.ill_conditioned)
+    return settled(normalize(best if plane is None else _mirrored(best, plane)), status, throw)
 
 
 @eqx.filter_jit

@@ -20,77 +20,71 @@ from jax.scipy.linalg import cho_factor, cho_solve
 
 from shisd import _checks
 from shisd._numerics import normalize
+from shisd._status import Status, settled
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition._mixtures import AbstractLobes, GaussianLobes
 
 
-class FitStatus(eqx.Enumeration):
-    """How a fit ended."""
-
-    ok = "The lobes are found."
-    step_limit = (
-        "The fit used up its steps; its best lobes are kept. Raise `max_steps` or `tolerance`, or give other starts."
-    )
-    coincident = (
-        "Two lobes are as good as one, from the start or by the fit: the result is that of fewer, or they cancel. "
-        "Opposite axes of zonal lobes are one. Use fewer, a `ridge`, or other starts (decomposition.lobe_starts)."
-    )
-    degenerate = (
-        "A lobe has become narrower than the samples are apart, or has no value at them, and means nothing. Use fewer "
-        "lobes, more samples, a `ridge`, or other starts (decomposition.lobe_starts)."
-    )
-
-
 class LobeFit(NamedTuple):
-    """The result of `fit_lobes`: lobes, their relative RMS error over the samples, steps of all starts, and status."""
+    """What `fit_lobes` returns."""
 
     lobes: AbstractLobes
     error: Scalar
     steps: Array
-    status: FitStatus
+    status: Status
 
 
 def fit_lobes(
-    start: AbstractLobes | Sequence[AbstractLobes],
+    start: int | AbstractLobes | Sequence[AbstractLobes],
     directions: ArrayLike,
     values: ArrayLike,
     solid_angles: ArrayLike,
     *,
+    starts: int = 1,
+    key: Array | None = None,
     max_steps: int = 256,
     tolerance: float | None = None,
     ridge: float = 0.0,
+    throw: bool = True,
 ) -> LobeFit:
     """The lobes nearest to samples of a function on the sphere, in least squares weighed by solid angle.
 
     Axes and widths move by BFGS from each start; weights are the best for them at every step. The best result wins.
 
-    Arguments: `start`, GaussianLobes or ZonalLobes, or several of one kind and size (`lobe_starts`): their weights are
-    not used, except for the degree of ZonalLobes. `directions` [N, 3]; `values` [*colour, N]; `solid_angles` [N] >= 0
-    in sr, the weights of the samples. Colours share axes and widths. Samples should cover the whole sphere, for nothing
-    holds lobes down where there are none. `ridge` >= 0 adds the squared norms of the lobes, so many times, to the
-    squared error: large lobes that cancel are then avoided, and neighbouring fits can be interpolated (1e-2 is enough);
-    it is at least what rounding needs. Static `max_steps` for each start; `tolerance` of the parameters and of the
-    squared error over that of the samples, by default eps^(1/2).
-    Returns a `LobeFit`; a fit that does not converge keeps its best lobes, and the status says what to try.
+    Arguments: `start`, how many Gaussians, which begin at the peaks of the samples; or GaussianLobes or ZonalLobes, one
+    or several of one kind and size: their weights are not used, except for the degree of ZonalLobes. With a number, the
+    second and further of static `starts` vary the first at random, from `key` (0 unless given). `directions` [N, 3];
+    `values` [*colour, N]; `solid_angles` [N] >= 0 in sr, the weights of the samples. Colours share axes and widths.
+    Samples should cover the whole sphere, for nothing holds lobes down where there are none. `ridge` >= 0 adds the
+    squared norms of the lobes, so many times, to the squared error: large lobes that cancel are then avoided, and
+    neighbouring fits can be interpolated (1e-2 is enough); it is at least what rounding needs. Static `max_steps` for
+    each start; `tolerance` of the parameters and of the squared error over that of the samples, by default eps^(1/2).
+    Returns (lobes, error, steps, status): `error` relative, RMS over the samples; steps of all starts; a
+    `shisd.Status`, ok, `step_limit`, `coincident` or `degenerate`. Other than ok it is an error, but with
+    `throw=False`, where the best lobes are kept.
     Derivatives: none; differentiate `evaluate` or `coefficients` of the result.
     Accuracy: mixtures of 1, 3 and 7 Gaussians are found again from 861 samples and 3 starts, their axes within 1e-9 rad
     in float64 and 4e-6, 3e-4 and 1e-3 rad in float32.
     Cost: steps x N x (columns)^2; `make bench` reports the time.
     """
     ridge = _checks.number("ridge", ridge)
-    starts = [start] if isinstance(start, AbstractLobes) else list(start)
-    _check_starts(starts)
+    if isinstance(start, int):
+        lobes = list(lobe_starts(directions, values, solid_angles, start, starts=starts, key=key))
+    else:
+        lobes = [start] if isinstance(start, AbstractLobes) else list(start)
+    _check_starts(lobes)
     w, y, areas = _samples(directions, values, solid_angles)
-    unknowns = sum(x.size for x in jax.tree.leaves(_parameters(starts[0]))) - starts[0].size  # axes have two each
-    unknowns += starts[0].linear.shape[-1] * (y.size // w.shape[0])
+    unknowns = sum(x.size for x in jax.tree.leaves(_parameters(lobes[0]))) - lobes[0].size  # axes have two each
+    unknowns += lobes[0].linear.shape[-1] * (y.size // w.shape[0])
     if y.size < unknowns:
         raise ValueError(f"`values` has {y.size} samples for {unknowns} unknowns. Add samples or use fewer lobes.")
-    stacked = jax.tree.map(lambda *x: jnp.stack(x).astype(w.dtype), *starts)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x).astype(w.dtype), *lobes)
     eps = float(jnp.finfo(w.dtype).eps)
-    penalty = jnp.asarray(max(ridge, 8 * starts[0].linear.shape[-1] * eps), w.dtype)
+    penalty = jnp.asarray(max(ridge, 8 * lobes[0].linear.shape[-1] * eps), w.dtype)
     max_steps = _checks.integer("max_steps", max_steps, 1)
     near = eps**0.5 if tolerance is None else _checks.number("tolerance", tolerance, positive=True)
-    return _fit(stacked, w, y, areas, penalty, max_steps, near)
+    found = _fit(stacked, w, y, areas, penalty, max_steps, near)
+    return settled(found, found.status, throw)
 
 
 @eqx.filter_jit
@@ -127,7 +121,7 @@ def _fit(
         before, after = loss(first, template), loss(found.value, template)
         better = after <= before  # False for NaN
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), found.value, first)
-        status = FitStatus.where(found.result == optx.RESULTS.successful, FitStatus.ok, FitStatus.step_limit)
+        status = Status.where(found.result == optx.RESULTS.successful, Status.ok, Status.step_limit)
         return best, jnp.where(better, after, before), found.stats["num_steps"], status
 
     # One start after another: batched factorisations may wait for each other for ever (see `_basis`).
@@ -138,9 +132,9 @@ def _fit(
     columns = lobes.columns(w) * root
     weights = _best_weights(columns, target, ridge)
     seen_by = jnp.sum(columns**2, axis=0) ** 2 / jnp.sum(columns**4, axis=0)  # samples, or NaN
-    status = FitStatus.where(_coincide(lobes), FitStatus.coincident, status)
+    status = Status.where(_coincide(lobes), Status.coincident, status)
     found = jnp.all(seen_by > 1.5) & jnp.all(jnp.isfinite(weights))
-    status = FitStatus.where(found, status, FitStatus.degenerate)
+    status = Status.where(found, status, Status.degenerate)
     lobes = lobes.with_linear((largest * (length * weights.T)).reshape(*y.shape[:-1], -1))
     return LobeFit(lobes, jnp.sqrt(error2(columns, weights)), jnp.sum(steps), status)
 
@@ -255,7 +249,7 @@ def _samples(
 
 def _check_starts(starts: Sequence[AbstractLobes]) -> None:
     if not starts or not all(isinstance(s, AbstractLobes) for s in starts):
-        raise ValueError("`start` must be GaussianLobes or ZonalLobes, or a sequence of them.")
+        raise ValueError("`start` must be GaussianLobes or ZonalLobes, a sequence of them, or a number of Gaussians.")
     shapes = [jax.tree.map(jnp.shape, s) for s in starts]
     if any(s != shapes[0] for s in shapes):
         raise ValueError("the lobes of `start` must be of one kind, number and degree.")

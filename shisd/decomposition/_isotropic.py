@@ -13,6 +13,7 @@ number of Gaussians at degree 20 falls from 2e4 to 70. And the axes of the level
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,22 +25,22 @@ from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import normalize, safe_sqrt, same_dtype
 from shisd._sharding import by_device
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._status import Status, settled
+from shisd._typing import Array, ArrayLike, Bool, Float, Scalar
 from shisd.decomposition import _basis
 from shisd.decomposition._directions import check_count
 from shisd.decomposition._kernels import AbstractKernel
-from shisd.harmonics import convolve, evaluate, sample_map, sh_basis, synthesize_map
+from shisd.harmonics import convolve, evaluate, sh_basis, synthesize_map
+from shisd.harmonics.internal import sample_map
 
 
-class Decomposition(Module):
-    """Weights with what is known about them.
-
-    weights [..., L+1, K]; residual [...], |M weights - c| / |c|, zero where c is; condition_number of M, without ridge.
-    """
+class Decomposition(NamedTuple):
+    """What `IsotropicBasis.solve` returns."""
 
     weights: Float[Array, "*batch l k"]
-    residual: Float[Array, "*batch"]
+    error: Float[Array, "*batch"]
     condition_number: Scalar
+    status: Status
 
 
 class IsotropicBasis(Module):
@@ -114,11 +115,17 @@ class IsotropicBasis(Module):
         return by_device(_weights, {"coefficients": c}, self, _checks.number("ridge", ridge))
 
     @method
-    def solve(self, coefficients: ArrayLike, *, ridge: float = 0.0) -> Decomposition:
-        """`weights`, with their residual and the condition number of M."""
+    def solve(self, coefficients: ArrayLike, *, ridge: float = 0.0, throw: bool = True) -> Decomposition:
+        """`weights` with what is known about them.
+
+        Returns (weights [..., L+1, K], error [...], condition_number, status): `error` is |M weights - c| / |c|, zero
+        where c is; the condition number that of M, without ridge; the `shisd.Status` ok, or `ill_conditioned` where
+        `weights` refuses, which is an error but with `throw=False`.
+        """
         c = _basis.check_coefficients(coefficients, self.degree)
-        weights, residual = by_device(_with_residual, {"coefficients": c}, self, _checks.number("ridge", ridge))
-        return Decomposition(weights, residual, _condition_number(self))
+        weights, error, bad = by_device(_with_error, {"coefficients": c}, self, _checks.number("ridge", ridge))
+        status = Status.where(jnp.any(bad), Status.ill_conditioned, Status.ok)
+        return settled(Decomposition(weights, error, _condition_number(self), status), status, throw)
 
     @method
     def coefficients(self, weights: ArrayLike) -> Float[Array, "*batch n"]:
@@ -180,13 +187,16 @@ class IsotropicBasis(Module):
         levels = np.arange(self.degree + 1, dtype=np.int32)[:, None]
         return jnp.where(mask[:, :, None], m[index, levels], 0)
 
-    def _solve(self, m: Float[Array, "n l k"], c: Float[Array, "*batch n"], ridge: float) -> Float[Array, "*batch l k"]:
+    def _solve(
+        self, m: Float[Array, "n l k"], c: Float[Array, "*batch n"], ridge: float
+    ) -> tuple[Float[Array, "*batch l k"], Bool[Array, " bad"]]:
         if self.kernel.diagonal:
-            return _basis.used_only(_basis.weights_by_band(self._blocks(m), c, self.degree, ridge), self.nested)
+            weights, bad = _basis.weights_by_band(self._blocks(m), c, self.degree, ridge)
+            return _basis.used_only(weights, self.nested), bad
         n = m.shape[0]
         columns = c.reshape(-1, n).T
-        weights = _basis.minimum_norm(m.reshape(1, n, -1), columns[None], np.ones((1, n), bool), [_SINGULAR], ridge)
-        return _basis.used_only(weights[0].T.reshape(*c.shape[:-1], *m.shape[1:]), self.nested)
+        weights, bad = _basis.minimum_norm(m.reshape(1, n, -1), columns[None], np.ones((1, n), bool), ridge)
+        return _basis.used_only(weights[0].T.reshape(*c.shape[:-1], *m.shape[1:]), self.nested), bad
 
     def _condition(self, m: Float[Array, "n l k"]) -> Scalar:
         if not self.kernel.diagonal:
@@ -254,19 +264,22 @@ def _matrix(basis: IsotropicBasis) -> Float[Array, "n l k"]:
 
 @eqx.filter_jit
 def _weights(batch: dict[str, Array], basis: IsotropicBasis, ridge: float) -> Float[Array, "*batch l k"]:
-    return basis._solve(_matrix(basis), batch["coefficients"], ridge)
+    weights, bad = basis._solve(_matrix(basis), batch["coefficients"], ridge)
+    if basis.kernel.diagonal:
+        return _basis.refused(weights, bad, basis.degree)
+    return eqx.error_if(weights, jnp.any(bad), _SINGULAR)
 
 
 @eqx.filter_jit
-def _with_residual(batch: dict[str, Array], basis: IsotropicBasis, ridge: float) -> tuple[Array, Array]:
+def _with_error(batch: dict[str, Array], basis: IsotropicBasis, ridge: float) -> tuple[Array, Array, Array]:
     m, c = _matrix(basis), batch["coefficients"]
-    weights = basis._solve(m, c, ridge)
+    weights, bad = basis._solve(m, c, ridge)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(c), axis=-1, keepdims=True))
     scale = jnp.where(largest > 0, largest, 1)  # squares of large and of small numbers leave the range
     norm = lambda a: safe_sqrt(jnp.sum((a / scale) ** 2, axis=-1))
     size = norm(c)
-    residual = norm(_apply(m, weights) - c) / jnp.where(size > 0, size, 1)
-    return weights, residual
+    error = norm(_apply(m, weights) - c) / jnp.where(size > 0, size, 1)
+    return weights, error, jnp.broadcast_to(jnp.any(bad), error.shape)
 
 
 @eqx.filter_jit

@@ -22,11 +22,10 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._module import Module
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.harmonics import legendre, zonal_basis
 from shisd.harmonics.internal import gauss_rows, legendre_of_versine, zonal_norms
 
@@ -117,23 +116,6 @@ class GaussianKernel(_BellKernel):
     def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
         degree = _checks.degree(degree)
         return gaussian_zonal(self._sharpness(degree, dtype), degree)
-
-
-class VonMisesFisherKernel(_BellKernel):
-    """Gaussians of unit integral, phi_l = k / (4 pi sinh k) exp(k x) with k = sharpness[l], by default l^2.
-
-    Source: ISD15 Eq. 30. Arguments: as `GaussianKernel`. A filter with such a kernel keeps the mean.
-    """
-
-    def __call__(self, x: ArrayLike, level: int) -> Float[Array, "*batch"]:
-        x = _checks.real_array("x", x)
-        bell, k = self._bell(x, level)
-        return bell / _gaussian_integral(k)
-
-    def zonal(self, degree: int, *, dtype: DTypeLike = float) -> Float[Array, "{degree}+1 {degree}+1"]:
-        degree = _checks.degree(degree)
-        k = self._sharpness(degree, dtype)
-        return gaussian_zonal(k, degree) / _gaussian_integral(k)[:, None]
 
 
 class GaussLegendreKernel(_BellKernel):
@@ -282,10 +264,3 @@ def _near_axis(h: Float[Array, " k"], degree: int, nodes: int) -> tuple[Array, A
     t = h[:, None] * jnp.asarray(np.sin(theta / 2) ** 2, h.dtype)[None]
     p = legendre_of_versine(t, degree) * jnp.asarray(zonal_norms(degree), h.dtype)[None, None]
     return t, p, h[:, None] * jnp.asarray(np.pi * gauss, h.dtype)[None]
-
-
-def _gaussian_integral(k: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Of exp(-k (1 - x)) over the sphere: 2 pi (1 - exp(-2 k)) / k."""
-    positive = k > 0
-    safe = jnp.where(positive, k, 1)
-    return 2 * np.pi * jnp.where(positive, -jnp.expm1(-2 * safe) / safe, 2 - 2 * k)

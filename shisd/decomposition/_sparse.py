@@ -59,7 +59,7 @@ def _choose(basis: RotatedZonalBasis, c: Float[Array, "*batch n"], count: int) -
     columns = m[:, :, chosen]
     wide = min((count + 1) // 2, basis.degree + 1)
     mask = padding(basis.degree)[1][:wide]
-    few = minimum_norm(columns[:wide], target[:wide], mask, [""] * wide, 4 * tolerance**2)  # which resolves any axes
+    few, _ = minimum_norm(columns[:wide], target[:wide], mask, 4 * tolerance**2)  # which resolves any axes
 
     def solve(band):
         columns, right = band

@@ -15,11 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import dot, normalize, same_dtype
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, ArrayLike, DTypeLike, Float
 from shisd.decomposition import fibonacci_directions, optimized_directions
 from shisd.decomposition.internal import TABLE_DEGREE
 from shisd.domains._polygon import SphericalPolygon, loop_solid_angle

@@ -14,14 +14,10 @@ from shisd.harmonics._sh import evaluate as evaluate
 from shisd.harmonics._sh import sh_basis as sh_basis
 from shisd.harmonics._transform import project as project
 from shisd.harmonics._transform import project_map as project_map
-from shisd.harmonics._transform import sample_map as sample_map
 from shisd.harmonics._transform import synthesize_map as synthesize_map
-from shisd.harmonics._windows import Deringed as Deringed
-from shisd.harmonics._windows import WindowStatus as WindowStatus
 from shisd.harmonics._windows import apply_window as apply_window
 from shisd.harmonics._windows import dering as dering
 from shisd.harmonics._windows import hann_window as hann_window
-from shisd.harmonics._windows import lanczos_window as lanczos_window
 from shisd.harmonics._windows import laplacian_window as laplacian_window
 from shisd.harmonics._zh import legendre as legendre
 from shisd.harmonics._zh import zonal_basis as zonal_basis

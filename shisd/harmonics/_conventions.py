@@ -14,7 +14,7 @@ import numpy as np
 
 from shisd import _checks
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import _tables
+from shisd.harmonics import _layout, _tables
 
 CONVENTIONS = ("shisd", "sphericart", "unsigned", "e3nn", "scipy", "3dgs", "ambix", "three.js", "filament")
 HIGHEST_DEGREE = {"3dgs": 3, "three.js": 2, "filament": 2}
@@ -91,7 +91,7 @@ def _degree(c: Array) -> int:
 
 def _factors(convention: str, degree: int) -> np.ndarray:
     """What takes our coefficients to those of a real convention with our axes, [(L+1)^2]."""
-    l, m = _tables.bands(degree), _tables.orders(degree)
+    l, m = _layout.bands(degree), _layout.orders(degree)
     unsigned = np.where(m % 2 == 1, -1.0, 1.0)
     if convention in ("shisd", "3dgs"):
         return np.ones(m.size)
@@ -133,13 +133,13 @@ def _complex_coefficients(value: ArrayLike) -> Array:
 
 def _pairs(c: Array) -> tuple[Array, Array]:
     """The coefficients of order |m| and of order -|m|, at every index."""
-    l, m = _tables.bands(_degree(c)), np.abs(_tables.orders(_degree(c)))
-    return c[..., l * l + l + m], c[..., l * l + l - m]
+    l, m = _layout.bands(_degree(c)), np.abs(_layout.orders(_degree(c)))
+    return c[..., _layout.place(l, m)], c[..., _layout.place(l, -m)]
 
 
 def _to_complex(c: Float[Array, "*batch n"]) -> Array:
     """c_lm = (a - i b) / sqrt(2), c_l-m = (-1)^m (a + i b) / sqrt(2) for a y_l^m + b y_l^-m, m > 0."""
-    m = np.broadcast_to(_tables.orders(_degree(c)), c.shape)
+    m = np.broadcast_to(_layout.orders(_degree(c)), c.shape)
     a, b = _pairs(c)
     real = jnp.where(m == 0, c, math.sqrt(0.5) * jnp.where((m < 0) & (m % 2 == 1), -a, a))
     imaginary = jnp.where(m == 0, 0, math.sqrt(0.5) * jnp.where((m < 0) & (m % 2 == 0), b, -b))
@@ -148,7 +148,7 @@ def _to_complex(c: Float[Array, "*batch n"]) -> Array:
 
 def _from_complex(c: Array) -> Float[Array, "*batch n"]:
     """The coefficients of the real part of the function."""
-    m = np.broadcast_to(_tables.orders(_degree(c)), c.shape)
+    m = np.broadcast_to(_layout.orders(_degree(c)), c.shape)
     plus, minus = _pairs(c)
     minus = jnp.where(m % 2 == 1, -minus, minus)
     a, b = (plus.real + minus.real) / 2, (minus.imag - plus.imag) / 2

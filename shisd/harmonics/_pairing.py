@@ -21,7 +21,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from shisd._numerics import rows_of
 from shisd._typing import Array, Float
-from shisd.harmonics import _tables
+from shisd.harmonics import _layout, _tables
 from shisd.harmonics._rotation import QUARTER, rates, swapped_series, turns
 
 _NEAR = 0.01  # sine of the angle to the pole
@@ -65,8 +65,8 @@ def _blocks(degree: int) -> tuple[_Block, ...]:
             degrees = of_parity[max(0, last - _DEGREES_TOGETHER) : last]
             l = degrees[:, None]
             a, b = (np.arange(first, max(first, degrees[-1]) + 1, 2) for first in (parity, 1 - parity))
-            xa, xb = (np.where(k <= l, l * l + l + k, none) for k in (a, b))
-            ya, yb = (np.where((k <= l) & (k > 0), l * l + l - k, none) for k in (a, b))
+            xa, xb = (_layout.place(l, k, none) for k in (a, b))
+            ya, yb = (np.where(k > 0, _layout.place(l, -k, none), none) for k in (a, b))
             part = functools.partial(_part, degrees, none)
             near = lambda *which, part=part: _diagonals(part(*which))
             blocks.append(_Block(

@@ -15,7 +15,7 @@ import numpy as np
 from shisd import _checks
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import _quadrature, _tables, _transform
+from shisd.harmonics import _layout, _quadrature, _tables, _transform
 
 
 def multiply(a: ArrayLike, b: ArrayLike, degree: int) -> Float[Array, "*batch n"]:
@@ -83,9 +83,9 @@ def _product_matrix(
     g: Array, azimuth: Array, polar: Array, azimuth_in: Array, polar_in: Array, degree: int, inputs: int
 ) -> Float[Array, "n_out n_in"]:
     pairs = jnp.einsum("jc,cm,cn->jmn", g, azimuth, azimuth_in)  # integral of T_m g T_m' along row j
-    columns = pairs[:, :, _index(_tables.orders(inputs) + inputs)] * polar_in.T[:, None, :]  # [row, m, column]
+    columns = pairs[:, :, _index(_layout.orders(inputs) + inputs)] * polar_in.T[:, None, :]  # [row, m, column]
     matrix = jnp.einsum("mlj,jmn->mln", polar, columns)
-    return matrix[_index(_tables.orders(degree) + degree), _index(_tables.bands(degree))]
+    return matrix[_index(_layout.orders(degree) + degree), _index(_layout.bands(degree))]
 
 
 @functools.cache
@@ -101,7 +101,7 @@ def _matrix_tables(degree: int, inputs: int, rows: int, columns: int) -> tuple[n
     p = _tables.associated_legendre(theta, max(degree, inputs))
     areas = weights * (2 * np.pi / columns)
     polar = p[: degree + 1, np.abs(np.arange(-degree, degree + 1))].transpose(1, 0, 2) * areas
-    return azimuth(degree), polar, azimuth(inputs), p[_tables.bands(inputs), np.abs(_tables.orders(inputs))]
+    return azimuth(degree), polar, azimuth(inputs), p[_layout.bands(inputs), np.abs(_layout.orders(inputs))]
 
 
 def _index(table: np.ndarray) -> np.ndarray:
@@ -141,5 +141,5 @@ def convolve(coefficients: ArrayLike, zonal: ArrayLike) -> Float[Array, "*batch 
             f"batch axes of `coefficients` {list(c.shape)} and `zonal` {list(k.shape)} do not broadcast."
         ) from error
     factors = k.astype(dtype) / jnp.broadcast_to(jnp.asarray(_tables.zonal_norms(degree), dtype), k.shape)
-    factors = jnp.broadcast_to(factors[..., _index(_tables.bands(degree))], (*shape, c.shape[-1]))
+    factors = jnp.broadcast_to(factors[..., _index(_layout.bands(degree))], (*shape, c.shape[-1]))
     return jnp.broadcast_to(c.astype(dtype), factors.shape) * factors

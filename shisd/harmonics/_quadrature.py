@@ -11,10 +11,9 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
-from shisd._typing import Array, Float
+from shisd._typing import Array, DTypeLike, Float
 
 
 def sphere_rule(degree: int, *, dtype: DTypeLike | None = None) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:

@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from shisd import _checks
 from shisd._numerics import angle_multiples
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import _tables
+from shisd.harmonics import _layout, _tables
 
 
 def rotate(coefficients: ArrayLike, rotation: ArrayLike) -> Float[Array, "*batch n"]:
@@ -100,7 +100,7 @@ def _rotate_many_away_from_pole(c: Array, r: Float[Array, "p 3 3"], degree: int)
     quarter = jnp.asarray(QUARTER, r.dtype)
     near = r[:, 2, 2] ** 2 > 0.5
     a, b, (cos_g, sin_g) = turns(jnp.where(near[:, None, None], r @ quarter.T, r), degree)
-    flip = jnp.asarray(np.where(_tables.orders(degree) < 0, -1, 1)[:, None, None], c.dtype)
+    flip = jnp.asarray(np.where(_layout.orders(degree) < 0, -1, 1)[:, None, None], c.dtype)
     shared = c.ndim == 2
     quartered = swap(c.T[..., None] if shared else c, degree) * flip
     quartered = quartered[..., 0].T if shared else quartered
@@ -135,9 +135,9 @@ def _angles(r: Float[Array, "p 3 3"]) -> tuple[tuple[Array, Array], tuple[Array,
 
 def _turn(x: Float[Array, "n f p"], cos: Array, sin: Array, degree: int) -> Float[Array, "n f p"]:
     """The turn about z whose multiples have these cosines and sines [L+1, p]."""
-    m, l = _tables.orders(degree), _tables.bands(degree)
+    m, l = _layout.orders(degree), _layout.bands(degree)
     sign = jnp.asarray(-np.sign(m)[:, None], x.dtype)
-    return cos[np.abs(m)][:, None] * x + (sign * sin[np.abs(m)])[:, None] * x[l * l + l - m]
+    return cos[np.abs(m)][:, None] * x + (sign * sin[np.abs(m)])[:, None] * x[_layout.place(l, -m)]
 
 
 def swap(x: Float[Array, "n f p"], degree: int) -> Float[Array, "n f p"]:

@@ -21,7 +21,7 @@ from shisd import _checks
 from shisd._numerics import angle_multiples, normalize
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import _tables
+from shisd.harmonics import _layout, _tables
 
 _POINTS_AT_ONCE = 1 << 15  # beyond this, expansions are evaluated in tiles so that memory stays bounded
 
@@ -106,7 +106,7 @@ def basis_at(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n
     polar = theta.T @ series
     # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
     azimuth = phi.T @ factors
-    return (polar * azimuth[:, _tables.orders(degree) + degree]).reshape(*u.shape[:-1], (degree + 1) ** 2)
+    return (polar * azimuth[:, _layout.orders(degree) + degree]).reshape(*u.shape[:-1], (degree + 1) ** 2)
 
 
 def weighted_sums(values: Float[Array, "*p_f"], u: Float[Array, "p 3"], degree: int) -> Float[Array, "*f_n"]:
@@ -130,7 +130,7 @@ def weighted_sums(values: Float[Array, "*p_f"], u: Float[Array, "p 3"], degree: 
 
     start = jnp.zeros((flat.shape[1] * series.shape[0], 2 * degree + 1), flat.dtype)
     sums, _ = jax.lax.scan(add, start, (fill(flat), fill(angles)))
-    sums = sums.reshape(flat.shape[1], series.shape[0], -1)[:, :, _tables.orders(degree) + degree]
+    sums = sums.reshape(flat.shape[1], series.shape[0], -1)[:, :, _layout.orders(degree) + degree]
     return jnp.sum(sums * jnp.asarray(series[None], u.dtype), axis=1).reshape(*values.shape[1:], -1)
 
 
@@ -150,8 +150,8 @@ def _basis_jvp(degree, primals, tangents):
 @functools.cache
 def _basis_tables(degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Polar series of every coefficient over cos, then sin(k theta); map from cos, then sin(m phi) to the orders."""
-    m = _tables.orders(degree)
-    table = _tables.polar_series(degree)[np.abs(m), :, _tables.bands(degree)].T * np.where(m == 0, 1, np.sqrt(2))
+    m = _layout.orders(degree)
+    table = _tables.polar_series(degree)[np.abs(m), :, _layout.bands(degree)].T * np.where(m == 0, 1, np.sqrt(2))
     series = np.concatenate([np.where(m % 2 == 0, table, 0), np.where(m % 2 == 1, table, 0)])
     factors = np.zeros((2 * (degree + 1), 2 * degree + 1))
     m = np.arange(-degree, degree + 1)
@@ -219,8 +219,8 @@ def _fourier(c: Float[Array, "f n"], degree: int) -> tuple[Array, Array]:
     """Double Fourier coefficients of expansions, for even and for odd orders m: [f * 2 * orders, L+1 over k]."""
     l = np.arange(degree + 1, dtype=np.int32)
     m = l[:, None]
-    positive = jnp.where((l >= m)[None], c[:, np.where(l >= m, l * l + l + m, 0)], 0)  # [f, m, l]
-    negative = jnp.where(((l >= m) & (m > 0))[None], c[:, np.where(l >= m, l * l + l - m, 0)], 0)
+    positive = jnp.where((l >= m)[None], c[:, _layout.place(l, m, 0)], 0)  # [f, m, l]
+    negative = jnp.where(((l >= m) & (m > 0))[None], c[:, _layout.place(l, -m, 0)], 0)
     both = jnp.stack([positive, negative], axis=1)
     scaled = _tables.polar_series(degree) * np.where(m == 0, 1, np.sqrt(2))[:, :, None]
     series = jnp.asarray(scaled, c.dtype)

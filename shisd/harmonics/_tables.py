@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from shisd.harmonics._layout import bands, orders, place
+
 Gather = tuple[tuple[np.ndarray, np.ndarray], ...]
 
 
@@ -58,19 +60,6 @@ def zonal_norms(degree: int) -> np.ndarray:
 
 
 @functools.cache
-def bands(degree: int) -> np.ndarray:
-    """The degree l of each coefficient. Indices are int32 in either precision, so that no trace depends on the mode."""
-    l = np.arange(degree + 1, dtype=np.int32)
-    return np.repeat(l, 2 * l + 1)
-
-
-@functools.cache
-def orders(degree: int) -> np.ndarray:
-    """The order m of each coefficient."""
-    return np.concatenate([np.arange(-l, l + 1, dtype=np.int32) for l in range(degree + 1)])
-
-
-@functools.cache
 def polar_series(degree: int) -> np.ndarray:
     """Fourier series of p in the polar angle, as [L+1, L+1, L+1] over (m, k, l).
 
@@ -101,7 +90,7 @@ def gradient_terms(degree: int) -> tuple[list[tuple[int, int, float]], ...]:
 
     def add(axis: int, l: int, m: int, m_from: int, factor: float) -> None:
         if abs(m_from) < l and factor:
-            terms[axis].append((l * l + l + m, l * l - l + m_from, factor))
+            terms[axis].append((place(l, m), place(l - 1, m_from), factor))
 
     for l in range(1, degree + 1):
         k = np.sqrt((2 * l + 1) / (2 * l - 1))
@@ -148,7 +137,7 @@ def generator_gather(degree: int) -> tuple[Gather, ...]:
 
     def add(axis: int, l: int, m_to: int, m_from: int, factor: float) -> None:
         if abs(m_to) <= l and factor:
-            terms[axis].append((l * l + l + m_to, l * l + l + m_from, factor))
+            terms[axis].append((place(l, m_to), place(l, m_from), factor))
 
     for l in range(1, degree + 1):
         for m in range(-l, l + 1):

@@ -22,13 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import DTypeLike
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import normalize, safe_sqrt
 from shisd._sharding import by_device
-from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import _quadrature, _tables
+from shisd._typing import Array, ArrayLike, DTypeLike, Float
+from shisd.harmonics import _layout, _quadrature, _tables
 
 Rows = Literal["gauss", "fejer", "cells"]
 Texels = Literal["cells", "samples"]
@@ -177,7 +176,7 @@ def _sample(batch: dict[str, Array], image: Array, texels: Texels) -> Array:
     x, y, z = w[..., 0], w[..., 1], w[..., 2]
     sine2 = x * x + y * y
     at_pole = sine2 == 0
-    sine = jnp.where(at_pole, 0, jnp.sqrt(jnp.where(at_pole, 1, sine2)))
+    sine = safe_sqrt(sine2)
     theta = jnp.where(at_pole, jnp.where(z < 0, np.pi, 0).astype(z.dtype), jnp.arctan2(sine, z))
     phi = jnp.arctan2(jnp.where(at_pole, 0, y), jnp.where(at_pole, 1, x))
 
@@ -355,7 +354,7 @@ def series_table(degree: int, dtype: DTypeLike) -> np.ndarray:
 def _block_index(degree: int) -> np.ndarray:
     """Where the block layout [p, q, h, i, r] keeps the coefficients of index l*(l+1)+m."""
     n = degree // 2 + 1
-    l, m = _tables.bands(degree), _tables.orders(degree)
+    l, m = _layout.bands(degree), _layout.orders(degree)
     place = (l % 2, np.abs(m) % 2, np.abs(m) // 2, l // 2, (m < 0).astype(int))
     return np.ravel_multi_index(place, (2, 2, n, n, 2)).astype(np.int32)  # int64 fails once traced in both precisions
 

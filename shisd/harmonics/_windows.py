@@ -1,6 +1,6 @@
 """Windows: one factor for each degree, against the ringing of truncated expansions.
 
-Follows Sloan 2008, *Stupid Spherical Harmonics (SH) Tricks*: Hann and Lanczos windows of a given width, and the window
+Follows Sloan 2008, *Stupid Spherical Harmonics (SH) Tricks*: the Hann window of a given width, and the window
 that penalises the squared Laplacian, made no stronger than needed for the function to stay above a floor. The minimum
 over the sphere is sought on a grid first, then by Newton steps from the lowest points.
 
@@ -11,7 +11,6 @@ import functools
 import math
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,8 +19,9 @@ import optimistix as optx
 from shisd import _checks
 from shisd._numerics import normalize
 from shisd._sharding import by_device
+from shisd._status import Status, settled
 from shisd._typing import Array, ArrayLike, Float, Scalar
-from shisd.harmonics import _quadrature, _sh, _tables, _transform
+from shisd.harmonics import _layout, _quadrature, _sh, _tables, _transform
 
 _CANDIDATES, _STEPS = 8, 6  # local minima of the grid that are refined, and Newton steps from each
 _RUNGS = 48  # strengths that are tried before the bisection
@@ -35,24 +35,11 @@ def hann_window(degree: int, width: ArrayLike | None = None) -> Float[Array, " b
     Derivatives: in `width`.
     Source: Sloan 2008.
     """
-    ratio = _ratio(degree, width)
-    return jnp.where(ratio < 1, (1 + jnp.cos(jnp.pi * ratio)) / 2, 0)
-
-
-def lanczos_window(degree: int, width: ArrayLike | None = None) -> Float[Array, " bands"]:
-    """Factors sin(pi l / width) / (pi l / width) of the degrees l = 0 ... `degree`; zero from l = width on.
-
-    Arguments, result, derivatives, source: as `hann_window`.
-    """
-    ratio = _ratio(degree, width)
-    return jnp.where(ratio < 1, jnp.sinc(ratio), 0)
-
-
-def _ratio(degree: int, width: ArrayLike | None) -> Float[Array, " bands"]:
     degree = _checks.degree(degree)
     w = _checks.scalar("width", degree + 1 if width is None else width)
     w = _checks.require(w, w > 0, "`width` must be > 0.")
-    return jnp.arange(degree + 1).astype(w.dtype) / jnp.broadcast_to(w, (degree + 1,))
+    ratio = jnp.arange(degree + 1).astype(w.dtype) / jnp.broadcast_to(w, (degree + 1,))
+    return jnp.where(ratio < 1, (1 + jnp.cos(jnp.pi * ratio)) / 2, 0)
 
 
 def laplacian_window(degree: int, strength: ArrayLike) -> Float[Array, " bands"]:
@@ -81,25 +68,15 @@ def apply_window(coefficients: ArrayLike, window: ArrayLike) -> Float[Array, "*b
             f"{list(window.shape)}."
         )
     dtype = jnp.promote_types(c.dtype, window.dtype)
-    return c.astype(dtype) * jnp.broadcast_to(window.astype(dtype)[_tables.bands(degree).astype(np.int32)], c.shape)
-
-
-class WindowStatus(eqx.Enumeration):
-    """Whether a window can keep the expansion above the floor."""
-
-    ok = "A window keeps the expansion above the floor."
-    mean_below_floor = (
-        "No window lifts an expansion above its own mean, which is not above `floor`. Lower `floor`, or check that the "
-        "function is positive and its coefficients are finite."
-    )
+    return c.astype(dtype) * jnp.broadcast_to(window.astype(dtype)[_layout.bands(degree).astype(np.int32)], c.shape)
 
 
 class Deringed(NamedTuple):
-    """The result of `dering`: windowed coefficients [..., (L+1)^2], their strengths [...] and one status for all."""
+    """What `dering` returns."""
 
     coefficients: Float[Array, "*batch n"]
     strength: Float[Array, "*batch"]
-    status: WindowStatus
+    status: Status
 
 
 def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = True) -> Deringed:
@@ -107,7 +84,8 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
 
     Arguments: `coefficients` [..., (L+1)^2], each expansion by itself; `floor`, a number. Where the expansion is above
     the floor already, it is returned as it is, with strength 0. Where its mean is not above the floor, no window can
-    help: an error, or with `throw=False` the mean alone, with strength inf, and the status says so.
+    help: an error, or with `throw=False` the mean alone, with strength inf, and `mean_below_floor` as the status.
+    Returns (coefficients [..., (L+1)^2], strength [...], status), one `shisd.Status` for all.
     Derivatives: of first order, both modes, by the implicit function theorem at the lowest direction; 0 where the
     strength is 0. Not smooth where the lowest direction changes, nor where the strength becomes positive.
     Accuracy: the minimum over the sphere reaches `floor` to 1e-9 of (mean - floor) in float64, 1e-4 in float32.
@@ -117,11 +95,8 @@ def dering(coefficients: ArrayLike, *, floor: ArrayLike = 0.0, throw: bool = Tru
     c, degree = _checks.coefficients("coefficients", coefficients)
     floor = _checks.scalar("floor", floor).astype(c.dtype)
     windowed, strength, hopeless = by_device(_dering_each, {"coefficients": c}, floor, degree)
-    status = WindowStatus.where(jnp.any(hopeless), WindowStatus.mean_below_floor, WindowStatus.ok)
-    if throw:
-        message = WindowStatus[WindowStatus.mean_below_floor]
-        windowed, strength = _checks.require((windowed, strength), ~jnp.any(hopeless), message)
-    return Deringed(windowed, strength, status)
+    status = Status.where(jnp.any(hopeless), Status.mean_below_floor, Status.ok)
+    return settled(Deringed(windowed, strength, status), status, throw)
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -133,7 +108,7 @@ def _dering_each(batch: dict[str, Array], floor: Scalar, degree: int) -> tuple[A
 
 
 def _dering(c: Float[Array, " n"], floor: Scalar, degree: int) -> tuple[Array, Array, Array]:
-    curvature = jnp.asarray(_curvature(degree)[_tables.bands(degree)], c.dtype)
+    curvature = jnp.asarray(_curvature(degree)[_layout.bands(degree)], c.dtype)
 
     def windowed(c, log_strength):
         return c / (1 + jnp.exp(log_strength) * curvature)

@@ -14,12 +14,11 @@ from typing import ClassVar, TypeVar, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._module import Module
-from shisd._numerics import normalize
-from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
+from shisd._numerics import normalize, safe_sqrt
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar, Vector
 
 Colour = Float[Array, "..."]  # () or (3,); the parameters of one model may mix both
 Parameter = ArrayLike | Sequence[float]
@@ -140,12 +139,12 @@ def conductor_fresnel(cosine: Scalar, eta: Colour, k: Colour) -> Colour:
     real, product = eta * eta - k * k - sine2, eta * k
     floor = (
         jnp.finfo(cosine.dtype).eps ** 2
-    )  # of sums that vanish only for eta = 1 or 0, k = 0, at a limit of the angle
+    )  # of sums that vanish only at a limit of the angle, for eta = 1 or 0, k = 0
     size2 = real * real + 4 * product * product
-    size = jnp.where(size2 > 0, jnp.sqrt(jnp.where(size2 > 0, size2, 1)), 0)  # a^2 + b^2
+    size = safe_sqrt(size2)  # a^2 + b^2
     larger = jnp.maximum((size + jnp.abs(real)) / 2, floor)  # the larger of a^2 and b^2
     a2 = jnp.where(real >= 0, larger, product * product / larger)
-    a = jnp.where(a2 > 0, jnp.sqrt(jnp.where(a2 > 0, a2, 1)), 0)  # a = 0: total reflection, derivative zero
+    a = safe_sqrt(a2)  # a = 0: total reflection, derivative zero
     s, d = jnp.maximum(size + cosine2, floor), 2 * a * cosine
     r_s = (s - d) / (s + d)
     s, d = jnp.maximum(cosine2 * size + sine2 * sine2, floor), d * sine2

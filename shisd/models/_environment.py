@@ -8,11 +8,11 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks, harmonics, io
 from shisd._module import Module
-from shisd._typing import Array, ArrayLike, Float
+from shisd._typing import Array, ArrayLike, DTypeLike, Float
+from shisd.harmonics.internal import sample_map
 from shisd.models.lights._distant import DistantLight
 
 
@@ -49,7 +49,7 @@ class Environment(Module):
         cls,
         path: str | os.PathLike[str],
         *,
-        source: Literal["shisd", "blender", "mitsuba"] = "shisd",
+        source: Literal["shisd", "blender", "radiance", "mitsuba", "filament", "three.js"] = "shisd",
         up: Literal["y", "z"] | None = None,
         bad_texels: Literal["clamp", "refuse"] = "clamp",
         layer: str | None = None,
@@ -60,10 +60,14 @@ class Environment(Module):
         - "shisd": row 0 is the zenith, +z; the left edge is +x and columns turn towards +y, counter-clockwise seen from
           above. A panorama seen from inside turns clockwise: read like this, its scene is mirrored.
         - "blender" (Cycles): +z up, the middle of the picture is +x, and columns turn from -x over +y to +x.
+        - "radiance": the same, as rtrace makes pictures by `view360stereo.cal` (one eye's half). Maps of `genssky` turn
+          the other way, from -x over -y to +x.
         - "mitsuba" (3.9): its own frame has +y up, and `up="y"` takes it as (z, x, y), so that the zenith is +z here
           too: the middle of the picture is +x, where Mitsuba has +z. `up="z"` is for scenes whose emitter is turned by
           rotate([1, 0, 0], 90): directions are then those of the scene, the middle of the picture is -y. Mitsuba puts
           the first and last rows onto the poles: up to half a texel of difference in theta.
+        - "filament", mirrored as its cmgen does unless told not to: as "mitsuba", with texels where they are here.
+        - "three.js": +y up too; the middle of the picture is its +x, which is +y here, or +x with `up="z"`.
         `up` is the axis that is up in the scene of `source`; by default that of the program itself. A map has its poles
         on this axis; a texel stays what it is. `layer` is that of `read_image`.
 
@@ -71,20 +75,21 @@ class Environment(Module):
         value of the map or of half precision, 65504, whichever is more, negative values 0, and a UserWarning gives the
         counts; `bad_texels="refuse"` raises ValueError.
         Other errors: as `read_image`, and ValueError for a map that is not 2:1 or has no finite value.
-        Source: Cycles' direction_to_equirectangular; Mitsuba's envmap, which the tests ask.
+        Source: Cycles' direction_to_equirectangular; Radiance's src/cal/cal/view360stereo.cal; Mitsuba's envmap, which
+        the tests ask; Filament's equirectangularToCubemap and mirrorCubemap (libs/ibl); three.js' equirectUv.
         """
-        if source not in _UP:
-            raise ValueError(f"`source` must be one of {', '.join(map(repr, _UP))}; got {source!r}.")
-        turned = source, up or _UP[source]
-        if turned not in _LEFT_EDGE:
-            raise ValueError(f'`up` must be "z", or "y" of source="mitsuba"; got {up!r} of source={source!r}.')
+        if source not in _LEFT_EDGE:
+            raise ValueError(f"`source` must be one of {', '.join(map(repr, _LEFT_EDGE))}; got {source!r}.")
+        left_edge = _LEFT_EDGE[source]
+        if up is not None and up not in left_edge:
+            raise ValueError(f"`up` must be {' or '.join(map(repr, left_edge))} for source={source!r}; got {up!r}.")
         if bad_texels not in ("clamp", "refuse"):
             raise ValueError(f'`bad_texels` must be "clamp" or "refuse"; got {bad_texels!r}.')
         texels = io.read_image(path, layer=layer)
         height, width = texels.shape[:2]
         if width != 2 * height:
             raise ValueError(f"{os.fspath(path)}: an environment is twice as wide as high; this is {width} x {height}.")
-        if (turn := _LEFT_EDGE[turned]) is not None:
+        if (turn := left_edge[up or next(iter(left_edge))]) is not None:
             if turn * width % 1:
                 raise ValueError(f"{os.fspath(path)}: a height that is even is needed to turn the map; it is {height}.")
             texels = np.roll(texels[:, ::-1], round(turn * width), axis=1)
@@ -131,19 +136,26 @@ class Environment(Module):
     def radiance(
         self, directions: ArrayLike, *, texels: Literal["cells", "samples"] = "cells"
     ) -> Float[Array, "*batch_and_colour"]:
-        """Radiance [..., *colour] from directions [..., 3], by `shisd.harmonics.sample_map`: that of the texel there.
+        """Radiance [..., *colour] from directions [..., 3]: that of the texel there.
 
         With texels="samples" bilinear between texel centres: smooth in a picture, but next to the poles of another
         power. Directions of any length are accepted; a zero vector or one that is not finite gives NaN. Output dtype is
         that of the directions. Derivatives: in texels and directions; those in directions are 0, or between samples
         jump from texel to texel.
         """
-        return harmonics.sample_map(self.texels, directions, texels=texels)
+        return sample_map(self.texels, directions, texels=texels)
 
 
-_UP = {"shisd": "z", "blender": "z", "mitsuba": "y"}
-# the azimuth of the left edge of the picture over 2 pi, from which columns turn clockwise; None: +x, counter-clockwise
-_LEFT_EDGE = {("shisd", "z"): None, ("blender", "z"): 1 / 2, ("mitsuba", "y"): 1 / 2, ("mitsuba", "z"): 1 / 4}
+# the azimuth of the left edge of the picture over 2 pi, from which columns turn clockwise, by the axis that is up, the
+# program's own first; None: +x, counter-clockwise
+_LEFT_EDGE: dict[str, dict[str, float | None]] = {
+    "shisd": {"z": None},
+    "blender": {"z": 1 / 2},
+    "radiance": {"z": 1 / 2},
+    "mitsuba": {"y": 1 / 2, "z": 1 / 4},
+    "filament": {"y": 1 / 2, "z": 1 / 4},
+    "three.js": {"y": 3 / 4, "z": 1 / 2},
+}
 
 
 def _as_radiance(texels: np.ndarray, path: str, bad_texels: str) -> np.ndarray:

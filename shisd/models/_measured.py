@@ -13,10 +13,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import io
-from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
+from shisd._numerics import safe_sqrt
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar, Vector
+from shisd.io.internal import merl_above_horizon
 from shisd.models._brdf import AbstractBrdf, above_horizon, parameter
 
 SHAPE = (90, 90, 180, 3)
@@ -68,7 +69,7 @@ class MeasuredBrdf(AbstractBrdf):
             raise ValueError(f"`dtype` {np.dtype(dtype)} needs jax_enable_x64.")
         values = io.read_merl(path)
         valid = np.isfinite(values) & (values >= 0)
-        missing = int(np.sum(~valid & io.merl_above_horizon()[..., None]))
+        missing = int(np.sum(~valid & merl_above_horizon()[..., None]))
         found = f"{os.fspath(path)}: {missing} of {values.size} values are above the horizon but negative or not finite"
         if missing and negative == "refuse":
             raise ValueError(f'{found}. Pass negative="fill" to take the nearest valid ones.')
@@ -148,8 +149,7 @@ def half_difference_angles(wi: Vector, wo: Vector) -> tuple[Scalar, Scalar, Scal
 
 
 def _length(vector: Array) -> Scalar:
-    square = jnp.sum(vector * vector)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    return safe_sqrt(jnp.sum(vector * vector))
 
 
 def _cell(position: Scalar, count: int) -> tuple[Array, Scalar]:

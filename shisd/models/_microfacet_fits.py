@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from shisd._numerics import safe_sqrt
 from shisd._typing import Array, ArrayLike, Scalar, Vector
 from shisd.models._brdf import AbstractBrdf, Colour, above_horizon, cast, colour, half_vector
 
@@ -119,8 +120,7 @@ class SgdMicrofacet(AbstractBrdf):
     def _masking(self, direction: Vector) -> Array:
         """G1(theta), with c (theta - theta0)^k from its logarithm, kept below 60: exp(60) = 1e26, and G1 long zero."""
         sine2 = direction[0] ** 2 + direction[1] ** 2
-        tilted = sine2 > 0
-        theta = jnp.arctan2(jnp.where(tilted, jnp.sqrt(jnp.where(tilted, sine2, 1)), 0), direction[2])
+        theta = jnp.arctan2(safe_sqrt(sine2), direction[2])
         beyond = theta > self.shift
         excess = jnp.where(beyond, theta - self.shift, 1)
         power = jnp.exp(jnp.minimum(jnp.log(self.c) + self.k * jnp.log(excess), math.log(60)))

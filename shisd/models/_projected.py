@@ -16,7 +16,7 @@ import numpy as np
 from shisd import _checks
 from shisd._typing import Array, ArrayLike, Float, Scalar, Vector
 from shisd.harmonics import sh_basis
-from shisd.harmonics.internal import bands, orders
+from shisd.harmonics.internal import bands, by_band, orders
 from shisd.models._brdf import AbstractBrdf, Colour, above_horizon
 
 
@@ -95,10 +95,7 @@ def by_order(c: Float[Array, "*colour m l k"]) -> Float[Array, "*colour orders l
 
 def to_orders(y: Float[Array, "*batch n"]) -> Float[Array, "*batch orders l"]:
     """What is indexed l (l+1) + m, as a matrix of m = -L ... L and l = 0 ... L, zero where l < |m|."""
-    degree = _checks.degree_of(y.shape[-1])
-    m, l = np.arange(-degree, degree + 1)[:, None], np.arange(degree + 1)[None]
-    index = np.where(l >= np.abs(m), l * l + l + m, y.shape[-1])
-    return jnp.concatenate([y, jnp.zeros_like(y[..., :1])], axis=-1)[..., index]
+    return jnp.swapaxes(by_band(y, _checks.degree_of(y.shape[-1])), -1, -2)
 
 
 def from_orders(c: Float[Array, "*batch orders l"]) -> Float[Array, "*batch n"]:

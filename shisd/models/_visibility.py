@@ -26,13 +26,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import _checks, io
+from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress, reporting
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
 from shisd.domains.internal import cap_coefficients
 from shisd.harmonics.internal import bands, orders, rotate_many, weighted_sums
+from shisd.io.internal import optional, ordinary, read_npz, write_atomically
 
 _RAYS_AT_ONCE = 1 << 20
 
@@ -81,12 +82,12 @@ class Visibility(Module):
         """
         return self.coefficients[:, 0] / math.sqrt(4 * np.pi)
 
-    def at(self, triangle: ArrayLike, weights: ArrayLike) -> Float[Array, "*batch n"]:
-        """Coefficients at points of the surface: `triangle` [...], its index; barycentric `weights` [..., 3].
+    def at(self, triangles: ArrayLike, barycentric: ArrayLike) -> Float[Array, "*batch n"]:
+        """Coefficients at points of the surface: the index of each one's triangle [...], and `barycentric` [..., 3].
 
         ValueError for triangles that do not exist, NaN under `jit`.
         """
-        corners, weights = surface_corners(self, triangle, weights)
+        corners, weights = surface_corners(self, triangles, barycentric)
         return by_device(_interpolated, {"corners": corners, "weights": weights}, self.coefficients)
 
     @classmethod
@@ -119,7 +120,7 @@ class Visibility(Module):
         without a normal (of no triangle, only of triangles without area, or of triangles that cancel), with their
         number; ImportError without the package.
         Accuracy: `noise`, wherever the mesh is and whatever its unit, as far as its coordinates are exact.
-        Not differentiable: for gradients see the derivative of `shade_environment_visibility` in the coefficients.
+        Not differentiable: for gradients see the derivative of `shading.shade` in the coefficients.
         Cost: V x rays rays.
         """
         degree, rays = _checks.degree(degree), _checks.integer("rays", rays, minimum=2)
@@ -159,21 +160,21 @@ class Visibility(Module):
         return cls(c, corners if points is None else corners[:0], noise)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write all fields as an .npz file, which is there completely or not at all (`shisd.io.write_atomically`).
+        """Write all fields as an .npz file, which is there completely or not at all.
 
         Errors: FileExistsError unless `overwrite=True`; ValueError for another suffix than .npz.
         """
         write = lambda file: np.savez_compressed(
             file, coefficients=self.coefficients, triangles=self.triangles, noise=self.noise
         )
-        io.write_atomically(_npz(path), write, overwrite=overwrite)
+        write_atomically(_npz(path), write, overwrite=overwrite)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Visibility":
         """What `save` wrote. FileNotFoundError, or ValueError for a file that holds something else."""
-        path = io.ordinary(_npz(path))
+        path = ordinary(_npz(path))
         try:
-            return cls(*io.read_npz(path, ("coefficients", "triangles", "noise")))
+            return cls(*read_npz(path, ("coefficients", "triangles", "noise")))
         except Exception as error:
             raise ValueError(f"{path}: not a file that Visibility.save wrote: {error}") from error
 
@@ -197,20 +198,20 @@ def cap_visibility(axes: ArrayLike, angles: ArrayLike, degree: int) -> Float[Arr
     return (-cap_coefficients(2 * jnp.sin(angle / 2) ** 2, a, degree)).at[..., 0].add(math.sqrt(4 * np.pi))
 
 
-def surface_corners(visibility: Visibility, triangle: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
+def surface_corners(visibility: Visibility, triangles: ArrayLike, barycentric: ArrayLike) -> tuple[Array, Array]:
     """Vertices and weights [..., 3] of points of the surface; weights are NaN where one of them does not exist."""
-    index, w = _integers("triangle", triangle), _checks.vectors("weights", weights)
+    index, w = _integers("triangles", triangles), _checks.vectors("barycentric", barycentric)
     if index.shape != w.shape[:-1]:
         raise ValueError(
-            f"`triangle` must be integers of the batch shape of `weights` {list(w.shape)}; got shape "
+            f"`triangles` must be integers of the batch shape of `barycentric` {list(w.shape)}; got shape "
             f"{list(index.shape)}."
         )
-    count, triangles = len(visibility.coefficients), visibility.triangles
-    if len(triangles) == 0:
+    count, corners_of = len(visibility.coefficients), visibility.triangles
+    if len(corners_of) == 0:
         raise ValueError("`visibility` has no triangles: it is that of points, whose rows are its `coefficients`.")
-    _check_range("triangle", index, len(triangles), "triangles")
+    _check_range("triangles", index, len(corners_of), "triangles")
     batch = {"index": jnp.asarray(index.astype(np.int32))[..., None], "weights": w}
-    corners, w = by_device(_corners, batch, triangles, count)
+    corners, w = by_device(_corners, batch, corners_of, count)
     return corners, w.astype(visibility.coefficients.dtype)
 
 
@@ -271,8 +272,8 @@ def _points(name: str, value: ArrayLike) -> np.ndarray:
 
 def _scene(points: np.ndarray, corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Whether rays from starts [N, 3] along directions [N, 3] hit a triangle; in float32, without gaps at edges."""
-    scenes = io.optional("embreex.rtcore_scene", "the package embreex", "mesh")
-    meshes = io.optional("embreex.mesh_construction", "the package embreex", "mesh")
+    scenes = optional("embreex.rtcore_scene", "the package embreex", "mesh")
+    meshes = optional("embreex.mesh_construction", "the package embreex", "mesh")
     scene = scenes.EmbreeScene(robust=True)
     meshes.TriangleMesh(scene=scene, vertices=points.astype(np.float32), indices=corners.astype(np.int32))
     return lambda starts, directions: scene.run(starts.astype(np.float32), directions.astype(np.float32)) != -1

@@ -15,13 +15,4 @@ notation: rho_l = slice; e_l = distant light; p_l = a local light, as a point se
 from shisd.planning._choice import Entry as Entry
 from shisd.planning._choice import Plan as Plan
 from shisd.planning._choice import plan as plan
-from shisd.planning._paths import PATHS as PATHS
-from shisd.planning._paths import Irradiance as Irradiance
-from shisd.planning._paths import Path as Path
-from shisd.planning._paths import Polygon as Polygon
-from shisd.planning._paths import Portal as Portal
-from shisd.planning._paths import Table as Table
-from shisd.planning._paths import Zonal as Zonal
-from shisd.planning._prediction import predict as predict
-from shisd.planning._scene import Light as Light
 from shisd.planning._scene import Scene as Scene

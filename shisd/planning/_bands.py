@@ -12,7 +12,7 @@ import numpy as np
 from shisd import _checks
 from shisd._typing import Array, Float
 from shisd.harmonics import multiply, sphere_rule
-from shisd.harmonics.internal import host_basis, zonal_norms
+from shisd.harmonics.internal import host_basis, of_order, zonal_norms
 from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
 from shisd.planning._scene import Light
 from shisd.shading import project_light
@@ -47,14 +47,13 @@ class Material:
     @functools.cached_property
     def mean_zonal(self) -> np.ndarray:
         """Coefficients [C, l] of y_l^0 in the mean slice."""
-        l = np.arange(self.degree + 1)
-        return np.einsum("v,cvl->cl", self.shares, self.coefficients[..., l * l + l])
+        return np.einsum("v,cvl->cl", self.shares, self.coefficients[..., of_order(self.degree, 0)])
 
     @functools.cached_property
     def uneven(self) -> np.ndarray:
         """Norms [C, V, l] of what slices have beside `mean_zonal`."""
-        l, c = np.arange(self.degree + 1), self.coefficients.copy()
-        c[..., l * l + l] -= self.mean_zonal[:, None]
+        c = self.coefficients.copy()
+        c[..., of_order(self.degree, 0)] -= self.mean_zonal[:, None]
         return _norms(c)
 
     def misfit(self, degree: int) -> np.ndarray:
@@ -62,7 +61,7 @@ class Material:
         square = np.zeros_like(self.norms)
         for m in range(0 if self.isotropic else -self.degree, self.degree + 1):  # sines vanish, seen from azimuth 0
             l = np.arange(abs(m), self.degree + 1)
-            b, h = self.coefficients[..., l * l + l + m], hemisphere_blocks(self.degree)[abs(m)]
+            b, h = self.coefficients[..., of_order(self.degree, m)], hemisphere_blocks(self.degree)[abs(m)]
             k = max(degree + 1 - abs(m), 0)
             solution = np.linalg.solve(h[:k, :k] + RIDGE * np.eye(k), h[:k])
             square[..., l] += (b - b[..., :k] @ solution) ** 2

@@ -7,10 +7,12 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress, reporting
+from shisd._status import Status
 from shisd._typing import Array, Float
 from shisd.decomposition.internal import TABLE_DEGREE
 from shisd.planning._bands import Material, Seen, known_light, known_material
@@ -49,8 +51,9 @@ class Plan(Module):
     paths: dict[str, tuple[Path, ...]]
 
     @property
-    def met(self) -> bool:
-        return all(entry.met for entry in self.entries)
+    def status(self) -> Status:
+        """The `shisd.Status`: ok, or `tolerance_not_met` by one of the entries."""
+        return Status.ok if all(entry.met for entry in self.entries) else Status.tolerance_not_met
 
     def shade(self, material: str, surface: Surface) -> Float[Array, "*batch_colour"]:
         """Radiance that leaves surface points of one material towards the viewer, from all lights of the scene.
@@ -87,7 +90,7 @@ def plan(
     max_degree: int = 30,
     margin: float = 1.5,
     elevations: int = 64,
-    throw: bool = False,
+    throw: bool = True,
     progress: Progress = None,
 ) -> Plan:
     """For each material and light of a scene, the cheapest path and the smallest degree that meet a tolerance.
@@ -98,9 +101,9 @@ def plan(
     ways. `elevations` of the tables, as in `shading.tabulate_brdf`.
     Distant lights that take the same path are added up before it, so only the first of them costs anything, and others
     join where they meet the tolerance there.
-    Where nothing meets the tolerance, the entry has the best that `max_degree` can do and `met` False, and a
-    UserWarning says so; `throw=True` raises ValueError instead. `progress`: None, True for a bar of tqdm, or a function
-    of (done, total) lights and materials.
+    Where nothing meets the tolerance, it is a ValueError; with `throw=False` the entry has the best that `max_degree`
+    can do and `met` False, the `status` is `tolerance_not_met`, and a UserWarning says so. `progress`: None, True for a
+    bar of tqdm, or a function of (done, total) lights and materials.
     Accuracy: predictions are for bands up to max(32, 2 max_degree). Over all orientations, what six photographed maps
     gave for three materials at degrees 2 to 12 was 0.65 to 1.06 times the prediction, of the worst colour. One picture
     does not show all orientations: there it was 0.2 to 4.2 times, four of five between 0.35 and 1.85, more for cameras
@@ -119,7 +122,7 @@ def plan(
         raise ValueError(f"`margin` must be >= 1; got {margin}.")
     with reporting(progress, len(scene.lights) + len(scene.materials), "plan") as step:
         made = _plan(scene, tolerance, margin, max_degree, elevations, step)
-    if not made.met:
+    if made.status != Status.ok:
         failed = [f"{e.material} under {e.light} ({100 * e.error:.2g} %)" for e in made.entries if not e.met]
         message = (
             f"`tolerance` {tolerance} with `margin` {margin} is not met at degree {max_degree}: {', '.join(failed)}. "
@@ -193,6 +196,17 @@ def _join(
 
 @eqx.filter_jit
 def _shade(paths: tuple[Path, ...], surface: Surface) -> Float[Array, "*batch_colour"]:
+    surface = _whole(surface)
     values = [path.shade(surface) for path in paths]
     most = max(value.ndim for value in values)
     return functools.reduce(jnp.add, (v.reshape(*v.shape, *(1,) * (most - v.ndim)) for v in values))
+
+
+def _whole(surface: Surface) -> Surface:
+    """With all batch axes in every array, so that what some paths ignore counts for all."""
+    names = ("normals", "views", "positions", "tangents")
+    vectors = {name: a for name in names if (a := getattr(surface, name)) is not None}
+    mask = surface.mask
+    shape = np.broadcast_shapes(*(a.shape[:-1] for a in vectors.values()), () if mask is None else mask.shape)
+    wide = {name: jnp.broadcast_to(a, (*shape, 3)) for name, a in vectors.items()}
+    return Surface(**wide, mask=None if mask is None else jnp.broadcast_to(mask, shape))

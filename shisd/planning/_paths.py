@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd._module import Module
+from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import convolve, evaluate
 from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
 from shisd.planning._bands import Distant, Local, Material
 from shisd.shading import Slices, Surface, shade
+from shisd.shading.internal import as_type, shade_points
 
 
 class Path(Module):
@@ -68,12 +70,9 @@ class Irradiance(Path):
         return cls(c)
 
     def shade(self, surface):
-        there = True if surface.mask is None else surface.mask[..., None]
-        normals = jnp.where(there, surface.normals, jnp.asarray([0, 0, 1], surface.normals.dtype))
-        c = self.coefficients.reshape(-1, 1, self.coefficients.shape[-1])
-        values = evaluate(c, normals.reshape(-1, 3)).T.reshape(*normals.shape[:-1], *self.coefficients.shape[:-1])
-        dark = (jnp.sum(normals * surface.views, axis=-1) < 0) | ~jnp.squeeze(jnp.asarray(there)[..., None], -1)
-        return jnp.where(dark.reshape(*dark.shape, *(1,) * (values.ndim - dark.ndim)), 0, values)
+        points, c = surface.points("normals", "views"), self.coefficients
+        dtype = jnp.result_type(c, points["normals"], points["views"])
+        return by_device(shade_points, as_type(points, dtype), _irradiance, c.astype(dtype))
 
 
 class Zonal(Path):
@@ -177,6 +176,13 @@ class Portal(AboveHorizon):
 
 
 PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal)
+
+
+def _irradiance(points: dict[str, Float[Array, "p 3"]], c: Float[Array, "*colour n"]) -> Float[Array, " p *colour"]:
+    normals, views = points["normals"], points["views"]
+    values = evaluate(c.reshape(-1, 1, c.shape[-1]), normals).T.reshape(-1, *c.shape[:-1])
+    below = jnp.sum(normals * views, axis=-1) <= 0
+    return jnp.where(below.reshape(-1, *(1,) * (values.ndim - 1)), 0, values)
 
 
 def _sum(lights: list[Distant], degree: int) -> Float[Array, "*colour n"]:

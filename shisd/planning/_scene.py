@@ -1,11 +1,13 @@
 """The scene that is planned for: materials, lights, and points that see the local ones."""
 
+from typing_extensions import TypeAliasType
+
 from shisd import _checks
 from shisd._module import Module
 from shisd._typing import Array, ArrayLike, Float
 from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
 
-Light = DistantLight | Environment | PolygonLight | PortalLight
+Light = TypeAliasType("Light", DistantLight | Environment | PolygonLight | PortalLight)
 
 
 class Scene(Module):

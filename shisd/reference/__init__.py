@@ -7,10 +7,7 @@ few pixels. Of polygons, the integral is over their area: by Monte Carlo, and by
 horizon.
 """
 
-from shisd.reference._environment import Visible as Visible
 from shisd.reference._environment import shade_environment as shade_environment
 from shisd.reference._environment import shade_environment_quadrature as shade_environment_quadrature
-from shisd.reference._integrand import Radiance as Radiance
-from shisd.reference._monte_carlo import Estimate as Estimate
 from shisd.reference._polygon import shade_polygon as shade_polygon
 from shisd.reference._polygon import shade_polygon_quadrature as shade_polygon_quadrature

@@ -3,8 +3,6 @@
 Directions are in world space and point away from the surface; image colour is the last axis.
 """
 
-from shisd.shading._degree import band_energies as band_energies
-from shisd.shading._degree import material_degree as material_degree
 from shisd.shading._footprint import Footprint as Footprint
 from shisd.shading._footprint import footprint as footprint
 from shisd.shading._material import Material as Material

@@ -1,7 +1,5 @@
 """Materials made ready: a form of their slices for light from all around, and one for light above the horizon."""
 
-from typing import Literal
-
 from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress
@@ -69,17 +67,19 @@ def as_material(material: object) -> Material:
             return Material(material, material)
         case Slices():
             return Material(None, material)
-        case BrdfMatrix():
+        case BrdfMatrix(domain="sphere"):
             return Material(material)
+        case BrdfMatrix():
+            raise ValueError(
+                "`material` is a BrdfMatrix that was fitted above the horizon only: for polygons and portals pass its "
+                "`slices()`, for other lights one with domain='sphere'."
+            )
     hint = " Make it ready by shading.prepare." if isinstance(material, AbstractBrdf) else ""
     came = type(material).__name__
     raise ValueError(f"`material` must come from shading.prepare, tabulate_brdf or project_brdf; got {came}.{hint}")
 
 
-Everywhere = Literal["DistantLight", "ZonalLight", "Occluded", "SphereLight"]
-
-
-def slices_everywhere(material: Material, light: Everywhere) -> Slices:
+def slices_everywhere(material: Material, light: str) -> Slices:
     """The slices for a light from all around that takes no matrix."""
     form = distant_form(material, light)
     if isinstance(form, BrdfMatrix):
@@ -89,7 +89,7 @@ def slices_everywhere(material: Material, light: Everywhere) -> Slices:
     return form
 
 
-def distant_form(material: Material, light: Everywhere) -> Slices | BrdfMatrix:
+def distant_form(material: Material, light: str) -> Slices | BrdfMatrix:
     if material.distant is None:
         raise ValueError(
             f"`material` was fitted above the horizon only, and a {light} shines on it from all around: pass "
@@ -98,7 +98,7 @@ def distant_form(material: Material, light: Everywhere) -> Slices | BrdfMatrix:
     return material.distant
 
 
-def local_form(material: Material, light: Literal["PolygonLight", "PortalLight"]) -> Slices:
+def local_form(material: Material, light: str) -> Slices:
     if material.local is None:
         raise ValueError(
             f"`material` has no slices for a {light}: pass shading.prepare(brdf, degree), or `slices()` of a matrix."

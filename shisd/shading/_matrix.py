@@ -20,15 +20,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._methods import method
 from shisd._module import Module
 from shisd._numerics import angle_multiples, safe_sqrt
-from shisd._typing import Array, Float, Scalar
+from shisd._typing import Array, DTypeLike, Float, Scalar
 from shisd.harmonics import sh_basis
-from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis
+from shisd.harmonics.internal import associated_legendre, gauss_rows, host_basis, of_order
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 from shisd.shading.slices._slices import Slices, check_domain, products_in_order
@@ -43,11 +42,11 @@ class BrdfMatrix(Module):
 
     blocks: for isotropic materials, the block [*colour, L+1-m, Lv+1-m] of every order m up to the lesser of L and Lv,
     rows l = m ... L and columns l' = m ... Lv; for anisotropic ones the whole F [*colour, (L+1)^2, (Lv+1)^2] alone.
-    `quadrature_error` and `domain` as in `Slices`. F means something for views above the horizon only.
+    `error` and `domain` as in `Slices`. F means something for views above the horizon only.
     """
 
     blocks: tuple[Float[Array, "*colour _ _"], ...]
-    quadrature_error: Scalar
+    error: Scalar
     degree: int = eqx.field(static=True)
     view_degree: int = eqx.field(static=True)
     isotropic: bool = eqx.field(static=True)
@@ -87,7 +86,7 @@ class BrdfMatrix(Module):
         y = host_basis(_directions(*(a.ravel() for a in grid)), self.view_degree)
         c = jnp.einsum("...ij,vj->...vi", self.matrix(), jnp.asarray(y, self.blocks[0].dtype))
         c = c if self.isotropic else c.reshape(*self.colour, *grid[0].shape, -1)
-        return Slices(c, quadrature_error=self.quadrature_error, isotropic=self.isotropic, domain=self.domain)
+        return Slices(c, error=self.error, isotropic=self.isotropic, domain=self.domain)
 
 
 def project_brdf(
@@ -151,12 +150,6 @@ def _project(
 def _azimuths(degree: int, view_degree: int) -> int:
     """Of the views of anisotropic materials: a slice's order m goes round m times with the view."""
     return max(32, 2 * max(degree, view_degree) + 4)
-
-
-def of_order(degree: int, m: int) -> np.ndarray:
-    """Where the coefficients of order m are, l = |m| ... degree."""
-    l = np.arange(abs(m), degree + 1)
-    return l * l + l + m
 
 
 def _directions(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:

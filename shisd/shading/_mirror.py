@@ -10,6 +10,7 @@ notation: r = mirror direction; tau = trace of C; e = light coefficients.
 """
 
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,14 +23,16 @@ from shisd._module import Module
 from shisd._numerics import angle_multiples, normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, ArrayLike, Float
-from shisd.harmonics import project_map, sample_map, synthesize_map
+from shisd.harmonics import project_map, synthesize_map
 from shisd.harmonics.internal import (
     angles_of,
     bands,
     basis_at,
     gradient_gather,
     pair_many,
+    place,
     rows,
+    sample_map,
     series_table,
     turned_series,
     zonal_norms,
@@ -101,7 +104,7 @@ def reflect(
 
     Derivatives: in every floating argument, both modes, also where the footprint is round or a point. With light as
     coefficients those of second order are NaN at mirror directions along the z axis; with maps those in directions jump
-    between texels, as in `harmonics.sample_map`, and those in variances between levels.
+    between texels, as in `Environment.radiance`, and those in variances between levels.
     """
     points, dtype = _points(footprint, mask)
     if isinstance(light, MirrorMaps):
@@ -210,7 +213,7 @@ def _by_parity(e: Float[Array, "f n"], degree: int) -> Float[Array, "2 2 h a i"]
     n, none = degree // 2 + 1, (degree + 1) ** 2
     m, l = np.mgrid[: 2 * n, : 2 * n]
     inside = (m <= l) & (l <= degree)
-    plus, minus = np.where(inside, l * l + l + m, none), np.where(inside & (m > 0), l * l + l - m, none)
+    plus, minus = np.where(inside, place(l, m), none), np.where(inside & (m > 0), place(l, -m), none)
     norm = jnp.asarray(np.where(m > 0, np.sqrt(2), 1)[None, None], e.dtype)
     both = jnp.pad(e, ((0, 0), (0, 1)))[:, np.stack([plus, minus]).astype(np.int32)] * norm  # f, sign, m, l
     both = both.reshape(-1, 2, n, 2, n, 2).transpose(5, 3, 2, 1, 0, 4)
@@ -236,22 +239,27 @@ def _gaussian(
     xx: Float[Array, " p"], xy: Float[Array, " p"], yy: Float[Array, " p"], degree: int
 ) -> tuple[Float[Array, "rows p"], Float[Array, "rows p"]]:
     """Coefficients of Gaussians of these covariances about the pole, as `harmonics._pairing` orders them."""
-    cos, sin, half, to_orders, plus, minus = _gaussian_tables(degree)
-    cos, sin, half = (jnp.asarray(a, xx.dtype) for a in (cos, sin, half))
+    tables = _gaussian_tables(degree)
+    cos, sin, half = (jnp.asarray(a, xx.dtype) for a in (tables.cos, tables.sin, tables.half_eigenvalues))
     spread = cos**2 @ xx[None] + sin**2 @ yy[None] + 2 * cos * sin @ xy[None]  # k.C k [directions, p]
     kept = jnp.exp(-half * spread[None])
-    c = jnp.einsum("lad,ldp->lap", jnp.asarray(to_orders, xx.dtype), kept).reshape(-1, len(xx))
+    c = jnp.einsum("lad,ldp->lap", jnp.asarray(tables.to_orders, xx.dtype), kept).reshape(-1, len(xx))
     c = jnp.pad(c, ((0, 1), (0, 0)))
-    return c[plus], c[minus]
+    return c[tables.plus], c[tables.minus]
+
+
+class _GaussianTables(NamedTuple):
+    cos: np.ndarray  # [d, 1] of directions k
+    sin: np.ndarray
+    half_eigenvalues: np.ndarray  # [l, 1, 1], l (l+1) / 2
+    to_orders: np.ndarray  # [l, a, d], from values over k to orders 0, 2, 4 ... of cosines, then of sines
+    plus: np.ndarray  # where `_pairing` takes its rows from, m >= 0
+    minus: np.ndarray
 
 
 @functools.cache
-def _gaussian_tables(degree: int) -> tuple[np.ndarray, ...]:
-    """Directions k as cosines and sines [d, 1]; l (l+1) / 2 [l, 1, 1]; the map [l, a, d] from values over k to orders
-    0, 2, 4 ... of cosines, then of sines; and where `_pairing` takes them from.
-
-    sqrt((l+m)! / (l-m)!) / (l (l+1))^(m/2) is the root of the product of 1 - i (i-1) / (l (l+1)) over i = 1 ... m.
-    """
+def _gaussian_tables(degree: int) -> _GaussianTables:
+    # sqrt((l+m)! / (l-m)!) / (l (l+1))^(m/2) is the root of the product of 1 - i (i-1) / (l (l+1)) over i = 1 ... m
     count, even = degree + 4, np.arange(0, degree + 1, 2)  # the series over k, even, to aliases beyond the degree
     angle = np.pi * np.arange(count) / count
     half = _half_eigenvalues(degree)
@@ -270,8 +278,11 @@ def _gaussian_tables(degree: int) -> tuple[np.ndarray, ...]:
         there = (index < (degree + 1) ** 2) & (k % 2 == 0)
         return np.where(there, l * 2 * len(even) + first + k // 2, to_orders.shape[0] * to_orders.shape[1])
 
-    index = places(plus, 0).astype(np.int32), places(minus, len(even)).astype(np.int32)
-    return np.cos(angle)[:, None], np.sin(angle)[:, None], half[:, None, None], to_orders, *index
+    index = [places(plus, 0), places(minus, len(even))]
+    return _GaussianTables(
+        np.cos(angle)[:, None], np.sin(angle)[:, None], half[:, None, None], to_orders,
+        *(where.astype(np.int32) for where in index),
+    )  # fmt: skip
 
 
 # ---- light as maps

@@ -31,7 +31,7 @@ from shisd._module import Module
 from shisd._numerics import arctan2, normalize, safe_sqrt
 from shisd._sharding import by_device
 from shisd._typing import Array, Float, Scalar
-from shisd.harmonics.internal import bands, quarter_mirror, swap_matrices
+from shisd.harmonics.internal import bands, by_band, quarter_mirror, swap_matrices
 from shisd.models import DistantLight
 from shisd.shading import _views
 from shisd.shading._material import Material, as_material, slices_everywhere
@@ -153,9 +153,17 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> Prefiltered:
     table = lambda x: jnp.asarray(pad(x), float)
     highest, none = min(-(-int(m.max()) // 4) * 4, degree), jnp.zeros((0, 0))
     return Prefiltered(
-        none, none, jnp.asarray(pad(order), jnp.int32), table(reduce), table(expand),
-        jnp.asarray(mirror), jnp.asarray(len(m), jnp.int32), jnp.zeros(()), highest, ((), ()),
-    )  # fmt: skip
+        profiles=none,
+        maps=none,
+        order=jnp.asarray(pad(order), jnp.int32),
+        reduce=table(reduce),
+        expand=table(expand),
+        mirror=jnp.asarray(mirror),
+        channels=jnp.asarray(len(m), jnp.int32),
+        error=jnp.zeros(()),
+        highest=highest,
+        colours=((), ()),
+    )
 
 
 def _channels(
@@ -209,7 +217,7 @@ def _centred(c: Float[Array, "s v n"], mirror: bool | Array, swaps: Float[Array,
     degree = len(swaps) - 1
     order = np.arange(-degree, degree + 1)[:, None, None]
     angle = jnp.where(mirror, jnp.asarray(order * _views.elevations(c.shape[1]), c.dtype), 0)  # [m, 1, v]
-    x = jnp.einsum("lkm,svlm->lksv", swaps, _banded(c))
+    x = jnp.einsum("lkm,svlm->lksv", swaps, by_band(c, degree))
     x = jnp.cos(angle)[None] * x + jnp.sin(angle)[None] * x[:, ::-1]  # Ry(theta) is J Z(-theta) J
     return jnp.einsum("lmk,lksv->lmsv", swaps, x)
 
@@ -222,14 +230,6 @@ def _swaps(degree: int) -> np.ndarray:
     for l, j in enumerate(swap_matrices(degree)):
         swaps[l, inner[l], inner[l]] = j
     return swaps
-
-
-def _banded(c: Float[Array, "*batch n"]) -> Float[Array, "*batch l m"]:
-    """Coefficients by band and order, zero where |m| > l."""
-    degree = _checks.degree_of(c.shape[-1])
-    l, m = np.arange(degree + 1)[:, None], np.arange(-degree, degree + 1)
-    padded = jnp.concatenate([c, jnp.zeros_like(c[..., :1])], axis=-1)
-    return padded[..., np.where(np.abs(m) <= l, l * l + l + m, -1)]
 
 
 # ---- tables
@@ -245,7 +245,7 @@ def _filter(
     a = jnp.einsum("al,lasv->sav", like.reduce, centred[:, like.degree + m])
     profiles = jnp.moveaxis(_views.spline_table(a, m), -1, 0).swapaxes(1, 2)  # [V+4, maps, s]
     error = _error(centred[:, like.degree :], a, e, like)
-    e = _banded(e)
+    e = by_band(e, like.degree)
     charts = jnp.stack([e, _about_x(e, swaps)])
     maps = jax.lax.map(lambda e: _chart(_series(e, like.order, like.expand, swaps)), charts)
     return {

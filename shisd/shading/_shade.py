@@ -6,18 +6,19 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from shisd._typing import Array, Float
 from shisd.models import DistantLight, Environment, Occluded, PolygonLight, PortalLight, SphereLight, ZonalLight
 from shisd.shading._material import Material, as_material
 from shisd.shading._matrix import BrdfMatrix
 from shisd.shading._surface import Surface, check_surface
-from shisd.shading._tiles import as_type, floating_type
+from shisd.shading._tiles import Form, as_type, floating_type
 from shisd.shading.paths import _distant, _occluded, _polygon, _sphere, _zonal
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices
 
-Light = DistantLight | ZonalLight | Occluded | PolygonLight | PortalLight | SphereLight
+Light = TypeAliasType("Light", DistantLight | ZonalLight | Occluded | PolygonLight | PortalLight | SphereLight)
 PATHS: dict[type, Path] = {
     DistantLight: _distant.PATH,
     ZonalLight: _zonal.PATH,
@@ -88,10 +89,11 @@ def shade(
         value = path.radiance(form, as_type(group, dtype), own, surface)
         batch = value.shape[: value.ndim - len(colour)]
         parts.append(value.reshape(*batch, *(1,) * (most - len(colour)), *colour))
-    return functools.reduce(jnp.add, parts)
+    shape = np.broadcast_shapes(*(part.shape for part in parts))
+    return functools.reduce(jnp.add, (jnp.broadcast_to(part, shape) for part in parts))
 
 
-def _known(lights: object) -> list[Light]:
+def _known(lights: Light | Sequence[Light]) -> list[Light]:
     """One light or several, as a list."""
     several = list(lights) if isinstance(lights, Sequence) else [lights]
     if not several:
@@ -110,7 +112,7 @@ def _hint(light: object) -> str:
     return " SH coefficients go into models.DistantLight." if isinstance(light, np.ndarray | jax.Array) else ""
 
 
-def _points(surface: Surface, path: Path, form: Slices | BrdfMatrix) -> dict[str, Array]:
+def _points(surface: Surface, path: Path, form: Form) -> dict[str, Array]:
     """The arrays of the surface that a path uses."""
     names = ["normals", "views"]
     if path.local:

@@ -1,5 +1,6 @@
 """Surface points: where they are, which way they face, and from where they are seen."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -47,7 +48,7 @@ class Surface(Module):
         self.positions, self.tangents = arrays.get("positions"), arrays.get("tangents")
         self.barycentric = arrays.get("barycentric")
         self.mask = None if mask is None else bools(mask)
-        self.triangles = None if triangles is None else _checks.any_array("triangles", triangles)
+        self.triangles = None if triangles is None else _indices(triangles)
         if (triangles is None) != (barycentric is None):
             raise ValueError("`triangles` [...] and `barycentric` [..., 3] belong together: pass both or none.")
         shapes = {name: a.shape[:-1] for name, a in arrays.items()}
@@ -78,6 +79,15 @@ def bools(mask: ArrayLike) -> Array:
     array = jnp.asarray(mask)
     if array.dtype != bool:
         raise ValueError(f"`mask` must be bool [...], True where there is a surface; got dtype {array.dtype}.")
+    return array
+
+
+def _indices(triangles: ArrayLike) -> Array:
+    array = _checks.any_array("triangles", triangles)
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise ValueError(f"`triangles` must be integers [...]; got dtype {array.dtype}.")
+    if not isinstance(triangles, jax.Array) and np.any(np.asarray(triangles) != np.asarray(array)):
+        raise ValueError(f"`triangles` must fit into {array.dtype}; got up to {np.max(np.abs(triangles))}.")
     return array
 
 

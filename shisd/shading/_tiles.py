@@ -7,15 +7,14 @@ with copies of its last point, before it meets the code that takes long to compi
 import functools
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 
 from shisd._numerics import normalize
-from shisd._typing import Array, Float
+from shisd._typing import Array, DTypeLike, Float
 from shisd.shading._frames import frame, tangent_frame
 
 Shape = tuple[int, ...]
@@ -26,6 +25,7 @@ _LANES = 64  # a tile is a multiple of this many points
 _ELSEWHERE = np.array([0.3217, 0.2741, 0.9063])  # a point and a direction, in place of what is masked
 
 
+@runtime_checkable
 class Form(Protocol):
     """What is asked of a material, tabulated or as a matrix."""
 

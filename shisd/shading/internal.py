@@ -1,6 +1,7 @@
-"""What planning takes from inside shading: slices of materials before they are tables."""
+"""What planning takes from inside shading: slices of materials before they are tables, batches of points."""
 
 from shisd.shading._tiles import as_type as as_type
+from shisd.shading._tiles import shade_points as shade_points
 from shisd.shading.slices._tabulate import project_slice as project_slice
 from shisd.shading.slices._upper import RIDGE as RIDGE
 from shisd.shading.slices._upper import hemisphere_blocks as hemisphere_blocks

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from shisd import decomposition, harmonics, io, models
+from shisd import decomposition, harmonics, models
 from shisd._numerics import normalize
+from shisd.decomposition._directions import conditioning_loss, low_discrepancy_directions, random_directions
+from shisd.io.internal import write_atomically
 from tests import truth
 from tests.bench.make_directions import band_matrix, worst_condition
 
@@ -42,10 +44,10 @@ def bench_directions(degrees=(4, 8, 12, 20, 32, 64)):
                 "table, prefixes": worst_condition(table, degree, nested=True),
                 "no set is below": truth.condition_bound(degree, count),
                 "Fibonacci": worst_condition(np.asarray(decomposition.fibonacci_directions(count)), degree),
-                "low discrepancy": worst_condition(np.asarray(decomposition.low_discrepancy_directions(count)), degree),
+                "low discrepancy": worst_condition(np.asarray(low_discrepancy_directions(count)), degree),
             }
             if degree <= 20:
-                start = decomposition.random_directions(count, jax.random.key(1))
+                start = random_directions(count, jax.random.key(1))
                 began = time.perf_counter()
                 found = np.asarray(decomposition.optimize_directions(start, degree))
                 row["random"] = worst_condition(np.asarray(start), degree)
@@ -72,7 +74,7 @@ def bench_objectives(degree=12, starts=6):
         bands = [y[:, l * l : (l + 1) ** 2] for l in range(degree + 1)]
         return -sum(jnp.linalg.slogdet(m.T @ m)[1] for m in bands)
 
-    power = lambda p: lambda z, _: decomposition.conditioning_loss(z, degree, power=p)
+    power = lambda p: lambda z, _: conditioning_loss(z, degree, power=p)
     candidates = {
         "-log det of all bands": [log_det],
         "mean times mean inverse (p = 1)": [power(1.0)],
@@ -82,7 +84,7 @@ def bench_objectives(degree=12, starts=6):
     }
     rows = []
     with jax.enable_x64(True):
-        initial = [decomposition.random_directions(2 * degree + 1, jax.random.key(i)) for i in range(starts)]
+        initial = [random_directions(2 * degree + 1, jax.random.key(i)) for i in range(starts)]
         for name, losses in candidates.items():
             stages = [eqx.filter_jit(functools.partial(minimise, loss, steps=768 // len(losses))) for loss in losses]
             run = lambda z, stages=stages: functools.reduce(lambda z, stage: stage(z), stages, z)
@@ -164,7 +166,7 @@ def kernels_figure(rows, path):
     panels[0].text(4, 7e15, "1/eps, float64", fontsize=7, color="grey", va="bottom")
     panels[-1].legend(fontsize=7, loc="upper left")
     figure.tight_layout()
-    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
     pyplot.close(figure)
 
 

@@ -26,7 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, harmonics, io, models, reference, shading
+from shisd import decomposition, harmonics, models, reference, shading
+from shisd.io.internal import write_atomically
 from tests.bench import lobes, monte_carlo, sh_rotation, split_sum
 from tests.bench.harness import Method, Task
 from tests.bench.timing import timed
@@ -299,7 +300,7 @@ def make_fits():
             table, seconds = timed(lambda brdf=brdf, count=count: lobes.fit_table(brdf, count), kind)
             arrays |= {f"{name}: {part}": getattr(table, part) for part in PARTS} | {f"{name}: seconds": seconds}
             print(f"{name} Gaussians: {seconds:.2f} s", flush=True)
-    io.write_atomically(FITTED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
+    write_atomically(FITTED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
 
 
 def shade_gaussians(parameters, normals, views):
@@ -354,7 +355,7 @@ def make_references():
             error = np.sqrt(np.mean((values[:16] - finer) ** 2) / np.mean(finer**2))
             arrays[f"{material}, {name}"], arrays[f"{material}, {name}: error"] = values, error
             print(f"{material}, {name}: RMS {np.sqrt(np.mean(values**2)):.4g}, error {error:.1e}", flush=True)
-    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
+    write_atomically(STORED, lambda file: np.savez_compressed(file, **arrays), overwrite=True)
 
 
 if __name__ == "__main__":

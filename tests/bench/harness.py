@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from shisd import io
+from shisd.io.internal import write_atomically
 from tests.bench import timing
 from tests.bench.timing import interleaved
 
@@ -190,7 +190,7 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
         axis.set_ylabel("relative RMSE")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2 * columns - (columns > 1), fontsize=7)
-    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110), overwrite=True)
     pyplot.close(figure)
 
 

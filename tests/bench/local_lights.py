@@ -33,7 +33,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import harmonics, io, models, reference, shading
+from shisd import harmonics, models, reference, shading
+from shisd.io.internal import write_atomically
 from tests.bench import area_lights, lobes, polygons
 from tests.bench.harness import Method, Task, run
 from tests.truth import scipy_basis, triangle_rule
@@ -327,7 +328,7 @@ def make() -> None:
 
     add("projection", coefficients(24), coefficients(18))
     FILE.parent.mkdir(exist_ok=True)
-    io.write_atomically(FILE, lambda file: np.savez_compressed(file, **stored), overwrite=True)
+    write_atomically(FILE, lambda file: np.savez_compressed(file, **stored), overwrite=True)
 
 
 def main() -> None:

@@ -21,7 +21,9 @@ import jax
 import numpy as np
 from scipy.special import sph_harm_y
 
-from shisd import decomposition, io
+from shisd import decomposition
+from shisd.decomposition._directions import low_discrepancy_directions, random_directions
+from shisd.io.internal import write_atomically
 
 OUTPUT = Path(decomposition.__file__).parent / "data" / "optimized_directions.npz"
 TOP = 64
@@ -46,9 +48,9 @@ def starts(degree: int, effort: float):
     numbers = {4: 150, 8: 60, 12: 30, 16: 16, 20: 8, 24: 6, 28: 5, TOP: 4}
     number = next(n for top, n in numbers.items() if degree <= top)
     yield decomposition.fibonacci_directions(count)
-    yield decomposition.low_discrepancy_directions(count)
+    yield low_discrepancy_directions(count)
     for i in range(round(effort * number)):
-        yield decomposition.random_directions(count, jax.random.fold_in(jax.random.key(degree), i))
+        yield random_directions(count, jax.random.fold_in(jax.random.key(degree), i))
 
 
 def best_axes(degree: int, effort: float) -> np.ndarray:
@@ -101,7 +103,7 @@ def main() -> None:
             table[rows], conditions[degree], nested[degree] = z, condition, worst_condition(z, degree, nested=True)
         found = {"directions": table, "conditions": conditions, "nested_conditions": nested}
         write = lambda file, found=found: np.savez_compressed(file, **found)
-        io.write_atomically(options.output, write, overwrite=True)
+        write_atomically(options.output, write, overwrite=True)
         jax.clear_caches()
 
 

@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from shisd import harmonics, io, models
+from shisd import harmonics, models
+from shisd.io.internal import write_atomically
 
 DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 SEED = 20150801
@@ -141,9 +142,7 @@ def main() -> None:
         }
         held = {"picture": picture.astype(np.float32), **CAMERA, **known, **made}
         held |= {f"truth_{key}": value for key, value in truth.items()}
-        io.write_atomically(
-            path, lambda file, held=held: np.savez_compressed(file, **held), overwrite=options.overwrite
-        )
+        write_atomically(path, lambda file, held=held: np.savez_compressed(file, **held), overwrite=options.overwrite)
         print(f"{path}: noise {100 * noise:.2g} %, {path.stat().st_size} bytes, {time.perf_counter() - start:.0f} s")
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from examples._scene import camera_rays, hits, load_mesh, sphere_hits, unit
 from shisd import harmonics, models, shading
 from shisd._numerics import normalize
+from shisd.harmonics.internal import sample_map
 from tests.bench.timing import interleaved
 
 DATA = Path(__file__).parents[2] / "examples" / "data"
@@ -88,7 +89,7 @@ def sampled(name: str, room: str, samples: int, filtered: bool = True) -> tuple[
     def picture(normals, positions, eye):
         views = normalize(eye[None] - positions)
         directions = 2 * jnp.sum(views * normals, axis=1, keepdims=True) * normals - views
-        looked = harmonics.sample_map(texels, directions, texels="samples")
+        looked = sample_map(texels, directions, texels="samples")
         light = jnp.zeros((*of.seen.shape, 3)).at[row, column].set(looked)
         if not filtered:
             return light

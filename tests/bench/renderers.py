@@ -30,7 +30,8 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from shisd import io, models, shading
+from shisd import models, shading
+from shisd.io.internal import write_atomically
 from tests.bench import make_pictures
 from tests.bench.harness import Method, Task
 
@@ -295,7 +296,7 @@ def main() -> None:
         stored |= {name: mean.astype(np.float32), f"{name} noise": noise}
         print(f"{name}: {len(mean)} pixels, {PASSES * PASS_SAMPLES} samples each, noise {noise:.2g}", flush=True)
     STORED.parent.mkdir(exist_ok=True)
-    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
+    write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
     print(f"{STORED.name}: {STORED.stat().st_size} bytes")
 
 

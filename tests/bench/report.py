@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from shisd import io
+from shisd.io.internal import write_atomically
 from tests.bench import applications, environments, harness, local_lights, renderers, roofline, spherical
 from tests.bench.run import DOCS, paste, table
 
@@ -120,13 +120,13 @@ def main() -> None:
             short = f"{applications.NOTE}\n\n{table(applications.summary(made))}" if name in APART else text
             keep(name, f"{short}\n\n{note}", text)
     report = "\n\n".join(["# Speed against error", note, *(long for _, long in sections.values())]) + "\n"
-    io.write_atomically(arguments.output / "report.json", json.dumps(results, indent=1), overwrite=True)
+    write_atomically(arguments.output / "report.json", json.dumps(results, indent=1), overwrite=True)
     for folder in folders[:1] if arguments.only else folders:  # a part does not replace the whole
-        io.write_atomically(folder / "report.md", report, overwrite=True)
+        write_atomically(folder / "report.md", report, overwrite=True)
     for name, (short, long) in sections.items() if arguments.pages else ():
         if name in APART:
             text = f"# {name.capitalize()}\n\n{note}\n\n{long}\n"
-            io.write_atomically(DOCS / f"{name}.md", text, overwrite=True)
+            write_atomically(DOCS / f"{name}.md", text, overwrite=True)
         if f"<!-- table:{name} -->" in (DOCS / "benchmarks.md").read_text():
             paste(name, short)
     print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")

@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import decomposition, domains, io, models, reference, shading
+from shisd import decomposition, domains, models, reference, shading
 from shisd.domains.moments import fold
 from shisd.harmonics import _tables
+from shisd.io.internal import write_atomically
 from tests.bench import conditioning, equation_22, lobes, native, planning, polygons, stability
 from tests.bench.timing import interleaved
 from tests.truth import zonal_moments
@@ -239,7 +240,7 @@ def cost_figure(rows, path):
     axes.set(xlabel="coefficients $(L+1)^2$", ylabel="us per triangle", title="Cost of one integral over a triangle")
     axes.legend()
     figure.tight_layout()
-    io.write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=120), overwrite=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=120), overwrite=True)
     pyplot.close(figure)
 
 
@@ -295,7 +296,7 @@ def paste(name, text):
     page, start = DOCS / "benchmarks.md", f"<!-- table:{name} -->"
     before, rest = page.read_text().split(start)
     rest = rest.split("<!-- /table -->", 1)[1]
-    io.write_atomically(page, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
+    write_atomically(page, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
 
 
 def main():
@@ -325,8 +326,8 @@ def main():
     tuned = os.environ.get("MALLOC_MMAP_MAX_") == "0"
     allocator = "tuned" if tuned else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
-    io.write_atomically(arguments.output / "bench.json", json.dumps(results, indent=1), overwrite=True)
-    io.write_atomically(arguments.output / "bench.md", "\n\n".join([*sections.values(), note]) + "\n", overwrite=True)
+    write_atomically(arguments.output / "bench.json", json.dumps(results, indent=1), overwrite=True)
+    write_atomically(arguments.output / "bench.md", "\n\n".join([*sections.values(), note]) + "\n", overwrite=True)
     for marker, names in PAGES.items() if arguments.pages else ():
         if all(name in sections for name in names):
             paste(marker, "\n\n".join([*(sections[name] for name in names), note]))

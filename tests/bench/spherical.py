@@ -25,8 +25,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y_all
 
-from shisd import harmonics, io
+from shisd import harmonics
 from shisd.harmonics._rotation import rotate_many
+from shisd.io.internal import write_atomically
 from tests.bench.harness import Method, Task
 from tests.truth import scipy_basis
 
@@ -738,7 +739,7 @@ def main() -> None:
             stored[f"{name}_{degree}_error"] = difference(finer, values)
             print(f"{name}, degree {degree}: error {stored[f'{name}_{degree}_error']:.1e}", flush=True)
     STORED.parent.mkdir(exist_ok=True)
-    io.write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
+    write_atomically(STORED, lambda file: np.savez_compressed(file, **stored), overwrite=True)
     print(f"{STORED.name}: {STORED.stat().st_size} bytes")
 
 

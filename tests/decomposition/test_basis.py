@@ -11,13 +11,14 @@ from jax.test_util import check_grads
 
 from shisd import decomposition
 from shisd.decomposition import RotatedZonalBasis
+from shisd.decomposition._directions import conditioning_loss, low_discrepancy_directions, random_directions
 from tests import truth
 from tests.marks import FLOAT32_FIRST
 
 SETS = {
     "fibonacci": lambda l: decomposition.fibonacci_directions(2 * l + 1),
-    "low discrepancy": lambda l: decomposition.low_discrepancy_directions(2 * l + 1),
-    "random": lambda l: decomposition.random_directions(2 * l + 1, jax.random.key(l)),
+    "low discrepancy": lambda l: low_discrepancy_directions(2 * l + 1),
+    "random": lambda l: random_directions(2 * l + 1, jax.random.key(l)),
     "optimized": decomposition.optimized_directions,
     "more than needed": lambda l: decomposition.fibonacci_directions(3 * l + 4),
 }
@@ -177,7 +178,7 @@ def test_batches_equal_loops_and_vmap(x64, rng):
 
 
 def test_sets_of_axes_can_be_vmapped(x64, rng):
-    sets = jnp.stack([decomposition.fibonacci_directions(7), decomposition.low_discrepancy_directions(7)])
+    sets = jnp.stack([decomposition.fibonacci_directions(7), low_discrepancy_directions(7)])
     c = jnp.asarray(rng.standard_normal(16))
     got = jax.jit(jax.vmap(lambda z: RotatedZonalBasis(z, 3).weights(c)))(sets)
     for z, w in zip(sets, got, strict=True):
@@ -227,7 +228,7 @@ def test_methods_compile_once_and_jit_takes_them(rng, caplog):
         lambda: basis.evaluate(weights, z),
         lambda: few.coefficients(2),
         lambda: decomposition.ZonalLobes(z, weights).evaluate(z),
-        lambda: decomposition.conditioning_loss(z, 2),
+        lambda: conditioning_loss(z, 2),
         lambda: gaussian.zonal(2),
         lambda: gaussian(c, 1),
         decomposition.IsotropicBasis(gaussian, decomposition.separate_directions(1), 1).matrix,
@@ -244,7 +245,7 @@ def test_methods_compile_once_and_jit_takes_them(rng, caplog):
 
 
 def test_derivatives_of_every_method(x64, rng):
-    z = decomposition.low_discrepancy_directions(6)
+    z = low_discrepancy_directions(6)
     c, at = jnp.asarray(rng.standard_normal(9)), jnp.asarray(unit(rng, 4))
     fixed = jnp.asarray(rng.standard_normal((3, 6)))
 
@@ -260,7 +261,7 @@ def test_derivatives_of_every_method(x64, rng):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["weights", "evaluate"])
 def test_second_derivatives(method, x64, rng):
-    z = decomposition.low_discrepancy_directions(6)
+    z = low_discrepancy_directions(6)
     c, at = jnp.asarray(rng.standard_normal(9)), jnp.asarray(unit(rng, 4))
     mixed = jnp.asarray(rng.standard_normal((3, 6)))
 
@@ -296,7 +297,7 @@ def test_a_basis_changed_by_gradient_steps_stays_consistent(x64, rng):
 
 @pytest.mark.parametrize("nested", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["shared", "nested"])
 def test_axes_at_the_poles_are_ordinary(nested, x64, rng):
-    z = np.array(decomposition.low_discrepancy_directions(6))
+    z = np.array(low_discrepancy_directions(6))
     z[0], z[5] = [0, 0, 1], [0, 0, -1]  # one axis, so five remain
     c = jnp.asarray(rng.standard_normal(9))
     weights = jax.jit(lambda z: RotatedZonalBasis(z, 2, nested=nested).weights(c))

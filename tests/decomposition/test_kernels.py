@@ -21,10 +21,6 @@ KERNELS = {
     "Legendre": (decomposition.LegendreKernel, lambda x, l: np.sqrt((2 * l + 1) / 4 / np.pi) * eval_legendre(l, x)),
     "Gaussian": (decomposition.GaussianKernel, lambda x, l: np.exp(-(1 - x) * l * l)),
     "Gaussian, widths": (lambda: decomposition.GaussianKernel(WIDTHS), lambda x, l: np.exp(-(1 - x) * WIDTHS[l])),
-    "von Mises-Fisher": (
-        lambda: decomposition.VonMisesFisherKernel(WIDTHS),
-        lambda x, l: WIDTHS[l] / (4 * np.pi * np.sinh(WIDTHS[l])) * np.exp(WIDTHS[l] * x),
-    ),
     "Gauss-Legendre": (
         decomposition.GaussLegendreKernel,
         lambda x, l: np.exp(-(1 - x) * l * l) * eval_legendre(l, x),
@@ -97,7 +93,6 @@ def test_gaussians_of_every_width_against_40_digits(sharpness, dtype):
 
 WIDE = {
     "Gaussian": decomposition.GaussianKernel,
-    "von Mises-Fisher": decomposition.VonMisesFisherKernel,
     "Gauss-Legendre": decomposition.GaussLegendreKernel,
     "Phong": decomposition.PhongKernel,
     "discs": decomposition.CapKernel,

@@ -8,6 +8,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jax.test_util import check_grads
 
 from shisd import harmonics
+from shisd.harmonics.internal import sample_map
 from tests.models.materials import spherical
 from tests.truth import scipy_basis
 
@@ -259,11 +260,11 @@ def test_lookup_of_cells_is_the_texel_there(dtype, rng):
     j, i = np.divmod(rng.permutation(60), 10)
     u, v = rng.uniform(0.02, 0.98, (2, 60))
     w = spherical(np.pi * (j + v) / 6, 2 * np.pi * (i + u) / 10)
-    got = harmonics.sample_map(image, (w * LENGTHS[rng.integers(0, 3, 60)]).astype(dtype))
+    got = sample_map(image, (w * LENGTHS[rng.integers(0, 3, 60)]).astype(dtype))
     assert got.dtype == dtype
     np.testing.assert_array_equal(got, image[j, i])
     poles = np.array([[0, 0, 1], [0, 0, -1]], dtype)
-    np.testing.assert_array_equal(harmonics.sample_map(image, poles), image[[0, -1], 0])
+    np.testing.assert_array_equal(sample_map(image, poles), image[[0, -1], 0])
 
 
 @pytest.mark.parametrize("kind", ["cells", "samples"])
@@ -271,7 +272,7 @@ def test_lookup_along_no_direction_is_not_a_number(kind):
     """Values and gradients, and of no other point."""
     image = np.ones((4, 8, 3), np.float32)
     bad = [[0, 0, 0], [np.nan, 0, 1], [0, 0, np.nan], [np.nan] * 3, [np.inf, 0, 1], [0, 0, 1], [1, 2, 3]]
-    both = jax.jit(jax.vmap(jax.value_and_grad(lambda w: jnp.sum(harmonics.sample_map(image, w, texels=kind)))))
+    both = jax.jit(jax.vmap(jax.value_and_grad(lambda w: jnp.sum(sample_map(image, w, texels=kind)))))
     value, slope = (np.asarray(x) for x in both(np.array(bad, np.float32)))
     assert np.isnan(value[:5]).all() and np.isnan(slope[:5]).all()
     np.testing.assert_allclose(value[5:], 3, rtol=1e-6)
@@ -282,8 +283,8 @@ def test_batches_may_be_sharded_or_empty():
     image, c = np.ones((4, 8), np.float32), np.arange(4, dtype=np.float32)
     ends = {
         (): (
-            lambda w: harmonics.sample_map(image, w),
-            lambda w: harmonics.sample_map(image, w, texels="samples"),
+            lambda w: sample_map(image, w),
+            lambda w: sample_map(image, w, texels="samples"),
             lambda w: harmonics.evaluate(c, w),
         ),
         (4,): (
@@ -311,14 +312,14 @@ def test_batches_may_be_sharded_or_empty():
 
 def test_errors_name_the_argument(as_user):
     image = np.zeros((4, 8), np.float32)
-    for verb in (lambda x: harmonics.project_map(x, 0), lambda x: harmonics.sample_map(x, np.ones(3, np.float32))):
+    for verb in (lambda x: harmonics.project_map(x, 0), lambda x: sample_map(x, np.ones(3, np.float32))):
         for wrong in (image[0], image[:0]):
             with pytest.raises(ValueError, match=r"`image` must have shape \[H, W"):
                 verb(wrong)
     with pytest.raises(ValueError, match='`texels` must be "cells" or "samples"; got \'pixels\''):
         harmonics.project_map(image, 0, texels="pixels")
     with pytest.raises(ValueError, match="`image` must have an even width"):
-        harmonics.sample_map(image[:, :7], np.ones(3, np.float32), texels="samples")
+        sample_map(image[:, :7], np.ones(3, np.float32), texels="samples")
     with pytest.raises(ValueError, match="`coefficients`"):
         harmonics.synthesize_map(np.zeros(5, np.float32), 4)
     with pytest.raises(ValueError, match="`height`"):

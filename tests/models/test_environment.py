@@ -258,12 +258,101 @@ def test_mitsuba_shows_the_same(tmp_path, rng, up):
         np.testing.assert_allclose(theirs, ours[j, i] * (1 + row / (height - 1)) / (1 + j / (height - 1)), rtol=2e-3)
 
 
+# ---- four maps of one bright texel in every program: near both poles and edges, and inside
+
+BRIGHT = [(0, 0), (2, 7), (5, 12), (7, 15)]
+HEIGHT = 8
+TO_OURS = {"z": lambda x, y, z: (x, y, z), "y": lambda x, y, z: (z, x, y)}  # where +z here is up in the program
+TURNED = lambda x, y, z: (x, -z, y)  # a scene with +z up, for which the map is turned by 90 degrees about x
+
+
+def cycles(x, y, z):
+    """direction_to_equirectangular_range, range (-2 pi, pi, -pi, pi): v from below."""
+    return (np.arctan2(y, x) - np.pi) / (-2 * np.pi), (np.arccos(z) - np.pi) / -np.pi
+
+
+def three_js(x, y, z):
+    """equirectUv of ShaderChunk/common.glsl.js, for textures with flipY: v from below."""
+    return np.arctan2(z, x) / (2 * np.pi) + 0.5, np.arcsin(y) / np.pi + 0.5
+
+
+def filament(x, y, z):
+    """toRectilinear of CubemapUtils::equirectangularToCubemap at what mirrorCubemap reads; its v is from above."""
+    u, v = (np.arctan2(-x, z) / np.pi + 1) / 2, (1 - np.arcsin(y) * 2 / np.pi) / 2
+    return u, 1 - v
+
+
+PROGRAMS = {
+    ("blender", None): (cycles, TO_OURS["z"]),
+    ("three.js", None): (three_js, TO_OURS["y"]),
+    ("three.js", "z"): (three_js, TURNED),
+    ("filament", None): (filament, TO_OURS["y"]),
+    ("filament", "z"): (filament, TURNED),
+}
+
+
+def bright(tmp_path, texel, **options):
+    """The map of one bright texel as it is in a file, and as it is loaded."""
+    texels = np.zeros((HEIGHT, 2 * HEIGHT, 3), np.float32)
+    texels[texel] = 1
+    write_exr(tmp_path / "bright.exr", texels)
+    return texels, Environment.load(tmp_path / "bright.exr", **options)
+
+
+@pytest.mark.parametrize("texel", BRIGHT)
+@pytest.mark.parametrize(("source", "up"), PROGRAMS)
+def test_a_texel_is_where_its_program_looks_it_up(tmp_path, rng, source, up, texel):
+    texels, environment = bright(tmp_path, texel, source=source, up=up)
+    to_uv, to_ours = PROGRAMS[source, up]
+    w = np.moveaxis(spherical(np.arccos(rng.uniform(-1, 1, 4000)), rng.uniform(0, 2 * np.pi, 4000)), -1, 0)
+    u, v = to_uv(*w)
+    column, row = (np.clip((a * n).astype(int), 0, n - 1) for a, n in ((u, 2 * HEIGHT), (1 - v, HEIGHT)))
+    shown = texels[row, column]
+    inside = np.all([np.abs(a * n - np.round(a * n)) > 1e-4 for a, n in ((u, 2 * HEIGHT), (v, HEIGHT))], axis=0)
+    got = np.asarray(radiance(environment, np.stack(to_ours(*w), axis=-1).astype(np.float32)))
+    assert np.sum(shown[inside]) > 0
+    np.testing.assert_array_equal(got[inside], shown[inside])
+
+
+@pytest.mark.parametrize("texel", BRIGHT)
+def test_a_texel_is_where_radiance_traces_it(tmp_path, texel):
+    """view360stereo.cal as it stands: rows $1 from above and columns $2 of both eyes' halves, the upper one here."""
+    texels, environment = bright(tmp_path, texel, source="radiance")
+    XD = YD = 2 * HEIGHT
+    first, second = np.mgrid[:HEIGHT, :XD]
+    px, py = (XD - 1) / 2 - second, YD - 0.5 - first
+    frac = lambda x: x - np.floor(x)
+    altitude, azimuth = (frac(py / (YD / 2)) - 0.5) * np.pi, 2 * np.pi / XD * px
+    direction = [np.cos(azimuth) * np.cos(altitude), np.sin(azimuth) * np.cos(altitude), np.sin(altitude)]
+    np.testing.assert_array_equal(radiance(environment, np.stack(direction, axis=-1).astype(np.float32)), texels)
+
+
+@pytest.mark.parametrize("texel", BRIGHT)
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_texel_is_where_mitsuba_is_brightest(tmp_path, up, texel):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    _, environment = bright(tmp_path, texel, source="mitsuba", up=up)
+    turn = mi.ScalarTransform4f() if up == "y" else mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    emitter = mi.load_dict({"type": "envmap", "filename": str(tmp_path / "bright.exr"), "to_world": turn})
+    mi.load_dict({"type": "scene", "emitter": emitter})
+    theirs = []
+    for x, y, z in np.asarray(environment.directions(), float).reshape(-1, 3):
+        si = mi.SurfaceInteraction3f()
+        si.wi = mi.Vector3f(*((-y, -z, -x) if up == "y" else (-x, -y, -z)))
+        theirs.append(emitter.eval(si)[0])
+    assert np.argmax(theirs) == np.argmax(environment.texels[..., 0]) and max(theirs) > 0.5
+
+
 def test_sources_that_are_not_known_are_refused(tmp_path, as_user):
     write_exr(tmp_path / "odd.exr", np.ones((3, 6, 3), np.float32))
+    known = "'shisd', 'blender', 'radiance', 'mitsuba', 'filament', 'three.js'"
     for options, message in (
-        ({"source": "maya"}, "`source` must be one of 'shisd', 'blender', 'mitsuba'; got 'maya'"),
-        ({"source": "blender", "up": "y"}, '`up` must be "z", or "y" of source="mitsuba"; got \'y\''),
+        ({"source": "maya"}, f"`source` must be one of {known}; got 'maya'"),
+        ({"source": "blender", "up": "y"}, "`up` must be 'z' for source='blender'; got 'y'"),
+        ({"source": "mitsuba", "up": "x"}, "`up` must be 'y' or 'z' for source='mitsuba'; got 'x'"),
         ({"source": "mitsuba", "up": "z"}, "odd.exr: a height that is even is needed to turn the map; it is 3"),
+        ({"source": "three.js"}, "odd.exr: a height that is even is needed to turn the map; it is 3"),
     ):
         with pytest.raises(ValueError, match=message):
             Environment.load(tmp_path / "odd.exr", **options)

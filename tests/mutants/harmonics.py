@@ -172,8 +172,8 @@ MUTANTS = [
     Mutant(
         "radiance between texels",
         _ENVIRONMENT,
-        old="harmonics.sample_map(self.texels, directions, texels=texels)",
-        new='harmonics.sample_map(self.texels, directions, texels="samples")',
+        old="sample_map(self.texels, directions, texels=texels)",
+        new='sample_map(self.texels, directions, texels="samples")',
         test=f"{_OF_ENVIRONMENT}::test_power_of_a_texel_is_the_same_everywhere",
     ),
     Mutant(

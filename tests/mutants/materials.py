@@ -55,7 +55,7 @@ MUTANTS = [
     Mutant(
         "conductor Fresnel without its guard",
         "shisd/models/_brdf.py",
-        old="a = jnp.where(a2 > 0, jnp.sqrt(jnp.where(a2 > 0, a2, 1)), 0)",
+        old="a = safe_sqrt(a2)",
         new="a = jnp.sqrt(a2)",
         test="tests/models/test_brdf.py::test_conductor_fresnel_is_finite_where_it_has_a_kink[float32]",
     ),
@@ -173,9 +173,9 @@ MUTANTS = [
     ),
     Mutant(
         "projected BRDF with orders reversed",
-        "shisd/models/_projected.py",
-        old="index = np.where(l >= np.abs(m), l * l + l + m, y.shape[-1])",
-        new="index = np.where(l >= np.abs(m), l * l + l - m, y.shape[-1])",
+        "shisd/harmonics/_layout.py",
+        old="padded[..., place(l, m, (degree + 1) ** 2)",
+        new="padded[..., place(l, -m, (degree + 1) ** 2)",
         test="tests/models/test_projected.py::test_value_is_the_sum_over_pairs_of_harmonics[float64-True]",
     ),
     Mutant(

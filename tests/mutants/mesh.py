@@ -2,7 +2,7 @@
 
 from tests.mutants import Mutant
 
-MODEL, VERB, PLOTS = "shisd/models/_visibility.py", "shisd/shading/_visibility.py", "shisd/plotting.py"
+MODEL, PATH, PLOTS = "shisd/models/_visibility.py", "shisd/shading/paths/_occluded.py", "shisd/plotting.py"
 TEST, DRAWN = "tests/shading/test_visibility.py::", "tests/test_plotting.py::"
 MUTANTS = [
     Mutant(
@@ -77,15 +77,15 @@ MUTANTS = [
     ),
     Mutant(
         "occlusion left out in shading",
-        VERB,
+        PATH,
         old='seen = at["visibility"] if v is None',
         new='seen = jnp.zeros_like(at["visibility"]).at[:, 0].set(np.sqrt(4 * np.pi)) if v is None',
         test=TEST + "test_nothing_hidden_is_the_environment_and_everything_is_dark",
     ),
     Mutant(
         "shading takes the first corner only",
-        VERB,
-        old='jnp.einsum("pc,pcn->pn", at["weights"], v[at["corners"]])',
+        PATH,
+        old='jnp.einsum("pc,pcn->pn", at["barycentric"], v[at["corners"]])',
         new='v[at["corners"][:, 0]]',
         test=TEST + "test_it_is_the_integral_of_the_three_expansions",
     ),

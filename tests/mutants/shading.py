@@ -3,7 +3,12 @@
 from tests.mutants import Mutant
 
 POLYGON, SURFACE = "tests/shading/test_polygon.py::", "tests/shading/test_surface.py::"
-MIRROR = "tests/shading/test_mirror.py::"
+MIRROR, SHADE = "tests/shading/test_mirror.py::", "tests/shading/test_shade.py::"
+LIGHTS = "tests/models/test_lights.py::"
+OUTLINE, DISTANT = "shisd/models/lights/_outline.py", "shisd/models/lights/_distant.py"
+SLICES = "shisd/shading/slices/_slices.py"
+SIDES = LIGHTS + "test_outlines_are_positive_where_they_are_lit_and_nothing_behind"
+MIXED = SHADE + "test_lights_of_mixed_kinds_add_up[colour0-float32]"
 SLICE = POLYGON + "test_values_and_gradients_of_the_slice[float32]"
 
 MUTANTS = [
@@ -17,7 +22,7 @@ MUTANTS = [
         old="change -= sum_first(speed * weight)", new="change -= 0 * sum_first(speed * weight)", test=SLICE,
     ),
     Mutant(
-        "gradients keep a tile of every light", "shisd/shading/_surface.py",
+        "gradients keep a tile of every light", "shisd/shading/_tiles.py",
         old="add = jax.checkpoint(lambda x, light: (x + radiance(light), None), prevent_cse=False)",
         new="add = lambda x, light: (x + radiance(light), None)",
         test=POLYGON + "test_gradients_keep_no_tile_of_each_light",
@@ -32,72 +37,72 @@ MUTANTS = [
         old="* (view[:, 2] * along - jnp.sin(theta) * dz)", new="* (0 * along)", test=SLICE,
     ),
     Mutant(
-        "frames do not turn with the normal", "shisd/shading/_surface.py",
+        "frames do not turn with the normal", "shisd/shading/_frames.py",
         old="return r, jnp.cross(jnp.cross(normal, dn)[:, :, None], r, axis=1)", new="return r, 0 * r", test=SLICE,
     ),
     Mutant(
-        "no clip at the horizon", "shisd/shading/_polygon.py",
+        "no clip at the horizon", "shisd/shading/paths/_polygon.py",
         old="whole, lambda: clip(outline, above))", new="whole, whole)", test=SLICE,
     ),
     Mutant(
-        "a light's plane from absolute coordinates", "shisd/shading/_polygon.py",
+        "a light's plane from absolute coordinates", OUTLINE,
         old="edges = light.points - light.points[:1]", new="edges = light.points",
         test=POLYGON + "test_far_from_the_origin[4e+06]",
     ),
     Mutant(
-        "lights are seen from behind", "shisd/shading/_polygon.py",
+        "lights are seen from behind", OUTLINE,
         old="jnp.minimum(side, 0)", new="jnp.maximum(side, 0)", test=POLYGON + "test_several_lights",
     ),
     Mutant(
-        "only the first light of a kind", "shisd/shading/_surface.py",
+        "only the first light of a kind", "shisd/shading/_tiles.py",
         old="if len(jax.tree.leaves(stack)[0]) == 1:", new="if len(jax.tree.leaves(stack)[0]) >= 1:",
         test=POLYGON + "test_several_lights",
     ),
     Mutant(
-        "no gradient through a portal's light", "shisd/shading/_polygon.py",
+        "no gradient through a portal's light", "shisd/shading/paths/_polygon.py",
         old="else product_matrices(incident,", new="else product_matrices(jax.lax.stop_gradient(incident),",
         test=POLYGON + "test_a_portal_is_the_light_behind_it",
     ),
     Mutant(
-        "projected lights have no emission", "shisd/shading/_polygon.py",
-        old="_constant_radiance(light)[..., None])", new="jnp.ones_like(_constant_radiance(light)[..., None]))",
+        "projected lights have no emission", "shisd/shading/_project_light.py",
+        old="(incident * Y_00)[..., None]", new="jnp.ones_like(incident)[..., None]",
         test=POLYGON + "test_projected_light",
     ),
     Mutant(
-        "NaN is dark", "shisd/shading/_surface.py",
+        "NaN is dark", "shisd/shading/_tiles.py",
         old="jnp.where(jnp.isfinite(mark), 0, jnp.nan) * mark", new="jnp.zeros_like(mark)",
         test=SURFACE + "test_nan_stays_nan[polygon]",
     ),
     Mutant(
-        "masked points are shaded first", "shisd/shading/_surface.py",
+        "masked points are shaded first", "shisd/shading/_tiles.py",
         old="jnp.where(mask, a, jax.lax.stop_gradient(other[name])[None])", new="a",
         test=SURFACE + "test_masks[environment]",
     ),
     Mutant(
-        "a view on the horizon sees", "shisd/shading/_surface.py",
+        "a view on the horizon sees", "shisd/shading/_tiles.py",
         old="seen = (local[:, 2] > 0)", new="seen = (local[:, 2] >= 0)",
         test=SURFACE + "test_a_view_on_the_horizon_sees_nothing[environment]",
     ),
     Mutant(
-        "rounding noise is a tangent", "shisd/shading/_surface.py",
+        "rounding noise is a tangent", "shisd/shading/_frames.py",
         old="_PARALLEL = 100 ", new="_PARALLEL = 0.01 ", test=SURFACE + "test_a_tangent_along_the_normal_is_no_frame",
     ),
     Mutant(
-        "every number of points is a size", "shisd/shading/_surface.py",
+        "every number of points is a size", "shisd/shading/_tiles.py",
         old="else octave // 16", new="else 1", test=SURFACE + "test_a_new_number_of_points_compiles_nothing_heavy",
     ),
     Mutant(
-        "light turned the wrong way", "shisd/shading/_environment.py",
+        "light turned the wrong way", "shisd/shading/paths/_distant.py",
         old="to_local = jnp.swapaxes(frame, 1, 2)", new="to_local = frame",
         test="tests/shading/test_environment.py::test_radiance_is_equation_22[float32-diffuse]",
     ),
     Mutant(
-        "norms of zonal light", "shisd/shading/_zonal.py",
+        "norms of zonal light", "shisd/shading/paths/_zonal.py",
         old="z = (z / jnp.broadcast_to(", new="z = (z * jnp.broadcast_to(",
         test="tests/shading/test_zonal.py::test_eq_24",
     ),
     Mutant(
-        "near balls are as far ones", "shisd/models/_light.py",
+        "near balls are as far ones", "shisd/models/lights/_sphere.py",
         old="sine2 / (1 + jnp.sqrt(1 - sine2))", new="sine2 / 2",
         test="tests/shading/test_sphere.py::test_zonal_coefficients_are_integrals_over_the_cap[float32]",
     ),
@@ -117,9 +122,84 @@ MUTANTS = [
         test=MIRROR + "test_footprints_from_images_are_derivatives_of_the_mirror_direction[sphere-float64]",
     ),
     Mutant(
-        "which hemisphere a close lamp is, by rounding", "shisd/shading/_polygon.py",
-        old="angle = loop_solid_angle(v, 2 * np.pi, _towards(light, relative))",
+        "which hemisphere a close lamp is, by rounding", "shisd/shading/_project_light.py",
+        old="angle = loop_solid_angle(v, 2 * np.pi, towards(light, relative))",
         new="angle = loop_solid_angle(v, 2 * np.pi)",
         test="tests/shading/test_polygon.py::test_projected_light_close_to_a_lamp",
+    ),
+    Mutant(
+        "lights of two sides have one", OUTLINE,
+        old="return side if light.two_sided else jnp.minimum(side, 0)", new="return jnp.minimum(side, 0)",
+        test=SIDES + "[float32-two-sided-square]",
+    ),
+    Mutant(
+        "the other side of a light takes light away", OUTLINE,
+        old="return side if light.two_sided", new="return -jnp.abs(side) if light.two_sided",
+        test=LIGHTS + "test_a_white_surface_is_lit_exactly_where_the_outline_is_above_its_horizon[two-sided]",
+    ),
+    Mutant(
+        "outlines run the way that they do seen from outside", OUTLINE,
+        old="jnp.where(side < 0, points[::-1],", new="jnp.where(side < 0, points,",
+        test=SIDES + "[float32-one-sided-square]",
+    ),
+    Mutant(
+        "outlines from the other side run the wrong way", OUTLINE,
+        old="jnp.where(side > 0, points, dark)", new="jnp.where(side > 0, points[::-1], dark)",
+        test=SIDES + "[float32-two-sided-square]",
+    ),
+    Mutant(
+        "outlines are seen from dark sides", OUTLINE,
+        old="jnp.where(side > 0, points, dark)", new="points", test=SIDES + "[float32-portal-square]",
+    ),
+    Mutant(
+        "only the first kind of light", "shisd/shading/_shade.py",
+        old="functools.reduce(jnp.add, (jnp.broadcast_to(part, shape) for part in parts))",
+        new="jnp.broadcast_to(parts[0], shape)", test=MIXED,
+    ),
+    Mutant(
+        "only the first distant light", "shisd/shading/paths/_distant.py",
+        old="return functools.reduce(jnp.add, parts)", new="return parts[0]", test=MIXED,
+    ),
+    Mutant(
+        "only the first light that is hidden in part", "shisd/shading/paths/_occluded.py",
+        old="return functools.reduce(jnp.add, parts)", new="return parts[0]", test=MIXED,
+    ),
+    Mutant(
+        "distant lights up to the lowest of their degrees", "shisd/shading/paths/_distant.py",
+        old="min(degree, max(light.degree", new="min(degree, min(light.degree", test=MIXED,
+    ),
+    Mutant(
+        "distant lights of few bands put among high ones", "shisd/shading/paths/_distant.py",
+        old="(0, size - c.shape[-1])]", new="(size - c.shape[-1], 0)]", test=MIXED,
+    ),
+    Mutant(
+        "norms of zonal light as distant light", DISTANT,
+        old="jnp.asarray(1 / zonal_norms(self.degree),", new="jnp.asarray(zonal_norms(self.degree),",
+        test=LIGHTS + "test_a_zonal_light_is_a_sum_of_legendre_polynomials[float32-colour0]",
+    ),
+    Mutant(
+        "distant light turned back", DISTANT,
+        old="rotate(self.coefficients, rotation)", new="rotate(self.coefficients, jnp.asarray(rotation).T)",
+        test=LIGHTS + "test_a_turned_light_comes_from_turned_directions[float32-colour0]",
+    ),
+    Mutant(
+        "surfaces without their mask", "shisd/shading/_surface.py",
+        old="for name in names} | masks(self.mask)", new="for name in names}", test=SURFACE + "test_masks[environment]",
+    ),
+    Mutant(
+        "slices that are cut keep their bands", SLICES,
+        old='self._with(self.coefficients[..., : (degree + 1) ** 2], "sphere")',
+        new='self._with(self.coefficients, "sphere")',
+        test=SHADE + "test_a_prepared_material_has_the_slices_of_tabulate_brdf[isotropic]",
+    ),
+    Mutant(
+        "slices for local light of the wrong degree", "shisd/shading/_material.py",
+        old="slices.cut(local_degree).above_horizon()", new="slices.cut(degree).above_horizon()",
+        test=SHADE + "test_a_prepared_material_has_the_slices_of_tabulate_brdf[isotropic]",
+    ),
+    Mutant(
+        "slices above the horizon are not fitted", SLICES,
+        old='self._with(fit_above(self.coefficients, ridge), "upper")', new='self._with(self.coefficients, "upper")',
+        test="tests/test_planning.py::test_the_tolerance_is_met_against_quadrature[clay-lamp]",
     ),
 ]  # fmt: skip

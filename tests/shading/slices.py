@@ -4,13 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import shading
-from shisd.harmonics import _tables
+from shisd.harmonics.internal import bands, orders
 from shisd.shading import _views
 
 
 def random_slices(degree, dtype, colour=(), views=8, domain="sphere"):
     """Smooth random slices, even across the plane of view, as those of isotropic materials are."""
-    l, m = _tables.bands(degree), _tables.orders(degree)
+    l, m = bands(degree), orders(degree)
     start, change = np.random.default_rng(3).normal(size=(2, *colour, 1, len(l))) * (m >= 0) / (1 + l) ** 2
     theta = _views.elevations(views)[:, None]
     return slices_of((start + change * np.cos(theta)) * np.sin(theta) ** np.maximum(m, 0), dtype, domain)

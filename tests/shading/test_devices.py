@@ -24,9 +24,10 @@ degree = 2
 basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(degree), degree)
 directions = basis.directions
 weights = jnp.asarray(rng.normal(size=(3, 4, degree + 1, len(directions))), jnp.float32)
-lobes = shading.Slices.from_weights(basis, weights)
+slices = shading.Slices.from_weights(basis, weights)
 upper = shading.Slices.from_weights(basis, weights, domain="upper")
-light = jnp.asarray(rng.normal(size=(3, (degree + 1) ** 2)), jnp.float32)
+coefficients = jnp.asarray(rng.normal(size=(3, (degree + 1) ** 2)), jnp.float32)
+light = models.DistantLight(coefficients)
 corners = np.asarray([[1, -0.5, 0.2], [1, 0.5, 0.2], [1, 0, 1]], np.float32)
 lamp = models.PolygonLight(corners, np.ones(3, np.float32))
 mesh = jax.make_mesh((4,), ("points",), axis_types=(jax.sharding.AxisType.Explicit,))
@@ -38,6 +39,9 @@ def over(array, *axes, mesh=mesh):
 def collectives(compiled):
     names = "all-gather", "all-reduce", "all-to-all", "collective-permute", "reduce-scatter"
     return {name: n for name in names if (n := len(re.findall(rf" {name}(?:-start)?\\(", compiled.as_text())))}
+
+def shade(slices, light, *surface):
+    return shading.shade(slices, light, shading.Surface(*surface))
 
 def close(a, b):
     a, b = np.asarray(a), np.asarray(b)
@@ -58,21 +62,21 @@ def test_values_and_gradients_of_sharded_points_are_those_of_one_device():
     program("""
 normals, views = unit(64), unit(64)
 sharded = over(normals, "points"), over(views, "points")
-forward = jax.jit(shading.shade_environment).lower(lobes, light, *sharded).compile()
+forward = jax.jit(shade).lower(slices, light, *sharded).compile()
 assert collectives(forward) == {}
-radiance = forward(lobes, light, *sharded)
+radiance = forward(slices, light, *sharded)
 assert radiance.sharding.spec[0] == "points" and len(radiance.addressable_shards) == 4
 
-def loss(lobes, light, normals, views):
-    radiance = shading.shade_environment(lobes, light, normals, views)
+def loss(slices, light, normals, views):
+    radiance = shade(slices, light, normals, views)
     return jnp.sum(radiance**2), radiance
 
 gradient = jax.jit(jax.grad(loss, (0, 1, 2), has_aux=True))
-expected, one = gradient(lobes, light, normals, views)
+expected, one = gradient(slices, light, normals, views)
 close(radiance, one)
-compiled = gradient.lower(lobes, light, *sharded).compile()
+compiled = gradient.lower(slices, light, *sharded).compile()
 assert collectives(compiled) == {"all-reduce": 1}, collectives(compiled)  # outside of the loop over tiles
-jax.tree.map(close, compiled(lobes, light, *sharded)[0], expected)
+jax.tree.map(close, compiled(slices, light, *sharded)[0], expected)
 try:
     over(unit(65), "points")
 except ValueError as error:
@@ -85,14 +89,14 @@ else:
 @pytest.mark.slow
 def test_values_and_gradients_under_polygons_are_those_of_one_device():
     program("""
-points = np.float32(0.1) * unit(64), unit(64), unit(64)
+positions, *points = np.float32(0.1) * unit(64), unit(64), unit(64)
+points.append(positions)
 sharded = [over(p, "points") for p in points]
-shade = jax.jit(shading.shade_polygon)
-forward = shade.lower(upper, lamp, *sharded).compile()
+forward = jax.jit(shade).lower(upper, lamp, *sharded).compile()
 assert collectives(forward) == {}
-close(forward(upper, lamp, *sharded), shade(upper, lamp, *points))
-loss = lambda lobes, lamp, *points: jnp.sum(shading.shade_polygon(lobes, lamp, *points) ** 2)
-gradient = jax.jit(jax.grad(loss, (0, 1, 2, 3)))
+close(forward(upper, lamp, *sharded), jax.jit(shade)(upper, lamp, *points))
+loss = lambda slices, lamp, *points: jnp.sum(shade(slices, lamp, *points) ** 2)
+gradient = jax.jit(jax.grad(loss, (0, 1, 2, 4)))
 jax.tree.map(close, gradient(upper, lamp, *sharded), gradient(upper, lamp, *points))
 """)
 
@@ -102,20 +106,20 @@ def test_every_verb_takes_sharded_batches():
     program("""
 normals, views = unit(8, 6), unit(8, 6)
 both = dict(mesh=grid)
-one = shading.shade_environment(lobes, light, normals, views)
+one = shade(slices, light, normals, views)
 for n, v in [
     (over(normals, "rows", "columns", **both), over(views, "rows", None, **both)),
     (over(normals, ("rows", "columns"), **both), views),
     (over(normals, None, "columns", **both), over(views, None, "columns", **both)),
 ]:
-    close(shading.shade_environment(lobes, light, n, v), one)
+    close(shade(slices, light, n, v), one)
 n = over(normals, "rows", "columns", **both)
-close(shading.shade_environment(lobes, light, n, views[0, 0]), shading.shade_environment(
-    lobes, light, normals, views[0, 0]))
-gradient = jax.jit(jax.grad(lambda e, n: jnp.sum(shading.shade_environment(lobes, e, n, views) ** 2)))
-close(gradient(light, over(normals, "rows", **both)), gradient(light, normals))  # an axis of the mesh without use
+close(shade(slices, light, n, views[0, 0]), shade(slices, light, normals, views[0, 0]))
+gradient = jax.jit(jax.grad(lambda light, n: jnp.sum(shade(slices, light, n, views) ** 2)))
+of_sharded = gradient(light, over(normals, "rows", **both))
+close(of_sharded.coefficients, gradient(light, normals).coefficients)  # an axis of the mesh without use
 try:
-    shading.shade_environment(lobes, light, n, over(views, "columns", **both))
+    shade(slices, light, n, over(views, "columns", **both))
 except ValueError as error:
     assert "sharded alike" in str(error) and "`views`" in str(error)
 else:
@@ -123,21 +127,25 @@ else:
 
 d = over(normals, "rows", "columns", **both)
 close(harmonics.sh_basis(d, 3), harmonics.sh_basis(normals, 3))
-close(harmonics.evaluate(light[:, None, None], d), harmonics.evaluate(light[:, None, None], normals))
+close(harmonics.evaluate(coefficients[:, None, None], d), harmonics.evaluate(coefficients[:, None, None], normals))
 many = unit(1 << 18)
-evaluate = jax.jit(harmonics.evaluate).lower(light[:, None], over(many, "points")).compile()
+evaluate = jax.jit(harmonics.evaluate).lower(coefficients[:, None], over(many, "points")).compile()
 assert collectives(evaluate) == {}
-close(evaluate(light[:, None], over(many, "points")), harmonics.evaluate(light[:, None], many))
+close(evaluate(coefficients[:, None], over(many, "points")), harmonics.evaluate(coefficients[:, None], many))
 
-window = models.PortalLight(corners, light)
+window = models.PortalLight(corners, coefficients)
 p = over(normals, "rows", "columns", **both)
-portal = lambda positions: shading.shade_portal(upper, window, positions, normals, views)
+portal = lambda positions: shade(upper, window, normals, views, positions)
 close(portal(p), portal(normals))
+ball = models.SphereLight([0.2, 0.1, 3], 0.5)
+several = [light, models.ZonalLight([0, 0.6, 0.8], [1, 0.5]), models.Occluded(light, coefficients[0]), ball, window]
+mixed = lambda positions: shade(slices, several, normals, views, positions)
+close(mixed(p), mixed(normals))
 for basis in (2, domains.HaarBasis(1)):
     close(shading.project_light(lamp, p, basis), shading.project_light(lamp, normals, basis))
 
 # in a shard_map of the caller's, whatever the axis type
 automatic = jax.make_mesh((4,), ("points",), axis_types=(jax.sharding.AxisType.Auto,))
-shade = lambda n, v: shading.shade_environment(lobes, light, n, v)
-close(jax.shard_map(shade, mesh=automatic, in_specs=P("points"), out_specs=P("points"))(normals, views), one)
+lit = lambda n, v: shade(slices, light, n, v)
+close(jax.shard_map(lit, mesh=automatic, in_specs=P("points"), out_specs=P("points"))(normals, views), one)
 """)

@@ -123,7 +123,7 @@ def test_radiance_is_the_product_of_slice_and_light(kind, dtype, rng):
     matrix = matrix_of(kind, dtype)
     light, normals, views, tangents = scene(rng, 200, dtype)
     views[0] = normals[0]
-    got = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views, tangents))
+    got = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views, tangents=tangents))
     assert got.dtype == dtype and got.shape == (200, 3)
     n, v, t = (unit(a.astype(float)) for a in (normals, views, tangents))
     t = unit(t - np.sum(t * n, axis=1, keepdims=True) * n)
@@ -142,15 +142,12 @@ def test_radiance_is_the_product_of_slice_and_light(kind, dtype, rng):
 def test_matrix_and_table_shade_alike(rng):
     matrix = matrix_of("isotropic", SINGLE)
     light, normals, views, _ = scene(rng, 200, np.float32)
-    expected = shading.shade(matrix.slices(), models.DistantLight(light), shading.Surface(normals, views))
-    got = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views))
-    np.testing.assert_allclose(got, expected, atol=1e-4 * np.max(np.abs(expected)))
-    low = shading.shade(
-        matrix, models.DistantLight(light[:, :4]), shading.Surface(normals, views)
-    )  # a light of fewer bands
+    shade = lambda material, e: shading.shade(material, models.DistantLight(e), shading.Surface(normals, views))
+    expected = shade(matrix.slices(), light)
+    np.testing.assert_allclose(shade(matrix, light), expected, atol=1e-4 * np.max(np.abs(expected)))
+    low = shade(matrix, light[:, :4])  # a light of fewer bands
     padded = np.where(np.arange(N) < 4, light, np.float32(0))
-    expected = shading.shade(matrix, models.DistantLight(padded), shading.Surface(normals, views))
-    np.testing.assert_allclose(low, expected, atol=2e-6 * np.max(np.abs(low)))
+    np.testing.assert_allclose(low, shade(matrix, padded), atol=2e-6 * np.max(np.abs(low)))
     below = shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, -normals))
     assert np.all(np.asarray(below) == 0)
 
@@ -163,7 +160,7 @@ def test_derivatives(x64, rng):
     shapes = [(3, DEGREE + 1 - m, VIEW_DEGREE + 1 - m) for m in range(DEGREE + 1)]
     blocks = tuple(jnp.asarray(rng.normal(size=shape)) for shape in shapes)
     matrix = shading.BrdfMatrix(blocks, jnp.zeros(()), DEGREE, VIEW_DEGREE, True)
-    radiance = jax.jit(lambda *a: shading.shade_matrix(matrix, *a))
+    radiance = jax.jit(lambda e, *a: shading.shade(matrix, models.DistantLight(e), shading.Surface(*a)))
     check_grads(radiance, (light, normals, views), order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
 
 
@@ -187,31 +184,32 @@ def test_lambertian(x64):
     np.testing.assert_allclose(
         shading.shade(matrix, models.DistantLight(light), shading.Surface(np.eye(3), np.eye(3))), 1, rtol=1e-8
     )
-    energy = shading.band_energies(matrix)
+    slices = matrix.slices()
+    energy = slices.energies()
     assert energy.shape == (64, 9)
     np.testing.assert_allclose(energy, np.broadcast_to(expected, (64, 9)), atol=1e-8)
     left = np.sqrt(1 - np.cumsum(expected) / np.sum(expected))  # of what these bands hold
     for degree in (1, 2, 4):
-        assert shading.material_degree(matrix, 1.01 * left[degree]) == degree
-    assert shading.material_degree(matrix, 0.99 * left[2]) == 4
-    with pytest.raises(ValueError, match="needs its last bands for `tolerance` 1e-05"):
-        shading.material_degree(matrix, 1e-5)
-    upper = shading.project_brdf(models.Lambertian(1.0), 8, view_degree=0, domain="upper")
-    np.testing.assert_allclose(np.sum(shading.band_energies(upper)[0, :2]), 2 / 3 / np.pi, rtol=1e-5)
-    assert shading.material_degree(upper, 1e-3) == 1  # cos is of degree 1 above the horizon
+        assert slices.needed_degree(1.01 * left[degree]) == degree
+    assert slices.needed_degree(0.99 * left[2]) == 4
+    with pytest.raises(ValueError, match="need their last bands for `tolerance` 1e-05"):
+        slices.needed_degree(1e-5)
+    upper = shading.project_brdf(models.Lambertian(1.0), 8, view_degree=0, domain="upper").slices()
+    np.testing.assert_allclose(np.sum(upper.energies()[0, :2]), 2 / 3 / np.pi, rtol=1e-5)
+    assert upper.needed_degree(1e-3) == 1  # cos is of degree 1 above the horizon
 
 
 @pytest.mark.slow
 def test_degree_is_the_same_from_table_and_matrix():
     table, matrix = both_of("sphere", SINGLE)
-    energy = np.asarray(shading.band_energies(table), float)
+    energy = np.asarray(table.energies(), float)
     theta = (np.arange(16) + 0.5) * np.pi / 32
     left = lambda e: np.sqrt(1 - np.cumsum(e, axis=-1) / np.sum(e, axis=-1, keepdims=True))
     tolerances = left(np.sin(2 * theta) @ energy), np.max(left(energy), axis=0)
     assert tolerances[1][3] > 1.1 * tolerances[0][3]
     for worst, tolerance in zip((False, True), tolerances, strict=True):
         for degree in (1, 3, 4):
-            found = [shading.material_degree(m, 1.02 * tolerance[degree], worst=worst) for m in (table, matrix)]
+            found = [s.needed_degree(1.02 * tolerance[degree], worst=worst) for s in (table, matrix.slices())]
             assert found == [degree] * 2, tolerance
 
 
@@ -225,25 +223,32 @@ def test_errors_name_the_argument(as_user, rng):
         shading.project_brdf(brdf, 2, domain="both")
     matrix = shading.BrdfMatrix((jnp.ones((N, 1)),), jnp.zeros(()), DEGREE, 0, False)
     light, normals, views, _ = scene(rng, 2, np.float32)
-    with pytest.raises(ValueError, match=r"`matrix` must come from shading.project_brdf; got int"):
-        shading.shade(1, models.DistantLight(light), shading.Surface(normals, views))
-    with pytest.raises(ValueError, match="`light_coefficients` must have"):
-        shading.shade(matrix, models.DistantLight(light[:, :5]), shading.Surface(normals, views))
-    with pytest.raises(ValueError, match=r"batch axes .* do not broadcast"):
-        shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, np.zeros((3, 3), np.float32), views))
+    sky, surface = models.DistantLight(light), shading.Surface(normals, views)
+    with pytest.raises(
+        ValueError, match="`material` must come from shading.prepare, tabulate_brdf or project_brdf; got i"
+    ):
+        shading.shade(1, sky, surface)
+    with pytest.raises(
+        ValueError, match=r"`coefficients` must have \(degree \+ 1\)\*\*2 coefficients on its last axis"
+    ):
+        shading.shade(matrix, models.DistantLight(light[:, :5]), surface)
+    with pytest.raises(ValueError, match=r"batch axes do not broadcast: .*`tangents` \[2\]"):
+        shading.shade(matrix, sky, shading.Surface(normals, np.zeros((3, 3), np.float32), tangents=views))
     upper = shading.BrdfMatrix(matrix.blocks, jnp.zeros(()), DEGREE, 0, True, "upper")
-    with pytest.raises(ValueError, match="`matrix` was fitted above the horizon only"):
-        shading.shade(upper, models.DistantLight(light), shading.Surface(normals, views))
-    with pytest.raises(ValueError, match=r"`tangents` \[..., 3\] are needed"):
-        shading.shade(matrix, models.DistantLight(light), shading.Surface(normals, views))
+    with pytest.raises(
+        ValueError, match="`material` is a BrdfMatrix that was fitted above the horizon only: .* pass its `slices"
+    ):
+        shading.shade(upper, sky, surface)
+    with pytest.raises(ValueError, match=r"`surface` needs `tangents` \[\.\.\., 3\]: this material is anisotropic"):
+        shading.shade(matrix, sky, surface)
     with pytest.raises(ValueError, match="`basis` must be a decomposition.RotatedZonalBasis of degree 3"):
         matrix.slices().weights(decomposition.RotatedZonalBasis(decomposition.optimized_directions(2), 2))
-    with pytest.raises(ValueError, match="`material` must come from shading.tabulate_brdf or shading.project_brdf"):
-        shading.material_degree(1, 0.1)
-    with pytest.raises(ValueError, match="`tolerance` must be > 0; got 0"):
-        shading.material_degree(matrix, 0)
-    with pytest.raises(ValueError, match="call material_degree outside jit"):
-        jax.jit(lambda m: shading.material_degree(m, 0.1))(matrix)
+    with pytest.raises(ValueError, match="`tolerance` must be finite and > 0; got 0"):
+        matrix.slices().needed_degree(0)
+    with pytest.raises(ValueError, match="call needed_degree outside jit"):
+        jax.jit(lambda m: m.slices().needed_degree(0.1))(matrix)
+    with pytest.raises(ValueError, match="the slices hold NaN or infinity"):
+        shading.Slices(np.full((4, 4), np.nan, np.float32)).needed_degree(0.1)
     with pytest.raises(Exception, match="The quadrature does not resolve this material"):
         shading.project_brdf(models.Ggx(0.02), 1, view_degree=0, quadrature=4)
 

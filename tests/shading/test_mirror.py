@@ -234,9 +234,8 @@ def test_the_gauss_weierstrass_kernel_is_nearer_than_others():
     l = np.arange(degree + 1)
     axes = width * np.eye(3)[:, :2]
     e = np.stack([np.eye((degree + 1) ** 2)[k * k + k] / np.sqrt((2 * k + 1) / (4 * np.pi)) for k in l])
-    ours = shading.reflect(
-        shading.Footprint(np.float32([0, 0, 1]), np.float32(axes)), models.DistantLight(np.float32(e))
-    )
+    footprint = shading.Footprint(np.float32([0, 0, 1]), np.float32(axes))
+    ours = shading.reflect(footprint, models.DistantLight(np.float32(e)))
     assert np.max(np.abs(ours - true)) < 0.07 * width**2 < np.max(np.abs(von_mises_fisher - true))
 
 
@@ -264,7 +263,13 @@ def hard_footprints(rng):
 
 def filter_of(r, e, anisotropic):
     """Radiance by tangent vectors at `r`, axes and light."""
-    return jax.jit(lambda v, axes, e: shading.reflect(shading.Footprint(r + v - jnp.sum(v * r, axis=1, keepdims=True) * r, axes), models.DistantLight(e), anisotropic=anisotropic))  # fmt: skip
+
+    @jax.jit
+    def radiance(v, axes, e):
+        footprint = shading.Footprint(r + v - jnp.sum(v * r, axis=1, keepdims=True) * r, axes)
+        return shading.reflect(footprint, models.DistantLight(e), anisotropic=anisotropic)
+
+    return radiance
 
 
 @pytest.mark.slow
@@ -287,12 +292,10 @@ def test_second_derivatives_of_filters(anisotropic, x64, rng):
 
 @pytest.mark.parametrize("anisotropic", [False, True])
 def test_tiles_and_batches(anisotropic, rng):
-    e, (r, axes) = light(rng, 3).astype(np.float32), footprints(rng, 0.1, 0.5, count=530)
+    e, (r, axes) = models.DistantLight(light(rng, 3).astype(np.float32)), footprints(rng, 0.1, 0.5, count=530)
     r, axes = r.astype(np.float32), axes.astype(np.float32)
     axes[7] = np.nan
-    shade = jax.jit(
-        lambda r, a: shading.reflect(shading.Footprint(r, a), models.DistantLight(e), anisotropic=anisotropic)
-    )
+    shade = jax.jit(lambda r, a: shading.reflect(shading.Footprint(r, a), e, anisotropic=anisotropic))
     whole = shade(r, axes)
     assert np.all(np.isnan(whole[7])) and np.all(np.isfinite(np.delete(whole, 7, axis=0)))
     np.testing.assert_allclose(jax.vmap(shade)(r[:4].reshape(2, 2, 3), axes[:4].reshape(2, 2, 3, 2)).reshape(4, 3),
@@ -329,6 +332,7 @@ def test_derivatives_of_filtered_maps(x64, rng):
 def test_errors_name_the_argument(as_user):
     image, seen, eye = np.ones((4, 5, 3), np.float32), np.ones((4, 5), bool), np.ones(3, np.float32)
     footprint = shading.Footprint(jnp.ones((4, 3)), jnp.ones((4, 3, 2)))
+    sky, maps = models.DistantLight(np.ones(4, np.float32)), shading.MirrorMaps.from_texels(np.ones((4, 8), np.float32))
     cases = [
         (lambda: shading.footprint(image, image[:3], eye, seen), r"`normals` and `positions` must have shape"),
         (lambda: shading.footprint(image, image, eye, seen.astype(int)), r"`seen` \[H, W\], bool; got"),
@@ -338,14 +342,15 @@ def test_errors_name_the_argument(as_user):
             lambda: shading.Footprint.from_derivatives(image, image, eye, image, image),
             r"`normal_derivatives` must have shape \[..., 3, 2\]",
         ),
-        (lambda: shading.reflect(image, models.DistantLight(np.ones(4, np.float32))), "`footprint` must come from shading.mirror_f"),
-        (lambda: shading.reflect(footprint, models.DistantLight(np.ones(5, np.float32))), "`light_coefficients` must have"),
+        (lambda: shading.reflect(image, sky), "`footprint` must come from shading.footprint"),
+        (lambda: models.DistantLight(np.ones(5, np.float32)), "`coefficients` must have"),
         (lambda: shading.Footprint(eye, image), r"`axes` must have shape \[..., 3, 2\]; got \[4, 5, 3\]"),
         (
-            lambda: shading.reflect(shading.Footprint(image, np.ones((3, 2))), models.DistantLight(np.ones(4, np.float32))),
+            lambda: shading.reflect(shading.Footprint(image, np.ones((3, 2))), sky),
             r"`footprint.axes` must have shape \[4, 5, 3, 2\]; got \[3, 2\]",
         ),
-        (lambda: shading.reflect(footprint, image), "`maps` must come from shading.prefilter_mirror"),
+        (lambda: shading.reflect(footprint, image), "`light` must be a models.DistantLight or shading.MirrorMaps"),
+        (lambda: shading.reflect(footprint, maps, anisotropic=True), "`anisotropic` belongs to a DistantLight"),
         (lambda: shading.MirrorMaps.from_texels(image), r"`texels` must have shape \[H, 2H\]"),
         (lambda: shading.MirrorMaps.from_texels(np.ones((4, 8), np.float32), levels=1), "`levels` must be >= 2"),
     ]  # fmt: skip

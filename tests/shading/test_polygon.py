@@ -35,6 +35,10 @@ def scene(rng, count=COUNT):
     return position, normal, view
 
 
+def surface_of(position, normal, view, dtype=np.float32):
+    return shading.Surface(*(a.astype(dtype) for a in (normal, view, position)))
+
+
 # ---- truth
 
 
@@ -59,22 +63,22 @@ def quadrature(integrand, points, position, normal, nodes=24):
     return np.sign(float(area.sum())) * area.astype(float) @ integrand(w.astype(float), frame)
 
 
-_slices = jax.jit(jax.vmap(lambda lobes, view: lobes.at(view), (None, 0)))
+_slices_at = jax.jit(jax.vmap(lambda slices, view: slices.at(view), (None, 0)))
 
 
-def expected_radiance(lobes, light, position, normal, view, points=QUAD):
+def expected_radiance(slices, light, position, normal, view, points=QUAD):
     """The clipped integral of the interpolated slice times light(world directions) [N, ...], SciPy's harmonics."""
     frames = np.stack([local_outline(points, p, n)[1] for p, n in zip(position, normal, strict=True)])
-    local = np.einsum("pij,pj->pi", frames, unit(view)).astype(lobes.coefficients.dtype)
+    local = np.einsum("pij,pj->pi", frames, unit(view)).astype(slices.coefficients.dtype)
     radiance = []
-    for p, n, c in zip(position, normal, np.asarray(_slices(lobes, local), float), strict=True):
+    for p, n, c in zip(position, normal, np.asarray(_slices_at(slices, local), float), strict=True):
         values = lambda w, frame, c=c: ((truth.scipy_basis(w, DEGREE) @ c) * light(w @ frame).T).T
         radiance.append(quadrature(values, points, p, n))
     return np.stack(np.broadcast_arrays(*radiance))
 
 
-def expected(lobes, points, position, normal, view):
-    return expected_radiance(lobes, lambda w: np.ones(len(w)), position, normal, view, points)
+def expected(slices, points, position, normal, view):
+    return expected_radiance(slices, lambda w: np.ones(len(w)), position, normal, view, points)
 
 
 def form_factors(points, position, normal):
@@ -96,12 +100,12 @@ def form_factors(points, position, normal):
 
 
 @functools.cache
-def lobes_of(name, degree, dtype, domain="upper"):
+def slices_of(name, degree, dtype, domain="upper"):
     return shading.tabulate_brdf(BRDFS[name](), degree, domain=domain)
 
 
 @functools.cache
-def slices(dtype):
+def random(dtype):
     return random_slices(DEGREE, np.dtype(dtype), domain="upper")
 
 
@@ -111,30 +115,31 @@ def white(dtype):
 
 
 @jax.jit
-def _shade(lobes, geometry, weights):
-    def radiance(points, *surface):
-        return shading.shade_polygon(lobes, models.PolygonLight(points, two_sided=True), *surface)
+def _shade(slices, geometry, weights):
+    def radiance(points, position, normal, view):
+        light = models.PolygonLight(points, two_sided=True)
+        return shading.shade(slices, light, shading.Surface(normal, view, position))
 
     value, pull = jax.vjp(radiance, *geometry)
     return value, pull(weights)
 
 
-def shade(lobes, points, position, normal, view, weights=None):
+def shade(slices, points, position, normal, view, weights=None):
     """Radiance [COUNT] of a two-sided light of at most five corners, and gradients of weights @ radiance by them."""
     five = points[np.minimum(np.arange(5), len(points) - 1)]
-    dtype = lobes.coefficients.dtype
+    dtype = slices.coefficients.dtype
     weights = np.ones(COUNT) if weights is None else weights
     geometry = [np.asarray(a, dtype) for a in (five, position, normal, view)]
-    value, (d_points, *rest) = jax.tree.map(np.asarray, _shade(lobes, geometry, np.asarray(weights, dtype)))
+    value, (d_points, *rest) = jax.tree.map(np.asarray, _shade(slices, geometry, np.asarray(weights, dtype)))
     return value, (np.add.reduceat(d_points, np.arange(len(points))), *rest)
 
 
-def slopes(lobes, geometry, weights, moves, step):
+def slopes(slices, geometry, weights, moves, step):
     """Of weights @ expected radiance, by differences, when one of the arrays at a time makes its move."""
     found = []
     for i, move in enumerate(moves):
         at = lambda t, i=i, move=move: [a + t * move if j == i else a for j, a in enumerate(geometry)]
-        ends = (expected(lobes, *at(t)) for t in (step, -step))
+        ends = (expected(slices, *at(t)) for t in (step, -step))
         found.append(weights @ np.subtract(*ends) / (2 * step))
     return np.array(found)
 
@@ -151,10 +156,10 @@ def check_slope(gradient, move, want, dtype, name):
 
 def test_values_and_gradients_of_the_slice(dtype, rng):
     """The clipped integral of the interpolated slice and its change with outline, position, normal and view."""
-    lobes, geometry, weights = slices(dtype.name), [QUAD, *scene(rng)], rng.normal(size=COUNT)
+    slices, geometry, weights = random(dtype.name), [QUAD, *scene(rng)], rng.normal(size=COUNT)
     geometry = [a.astype(dtype).astype(float) for a in geometry]
-    got, gradients = shade(lobes, *geometry, weights)
-    want = expected(lobes, *geometry)
+    got, gradients = shade(slices, *geometry, weights)
+    want = expected(slices, *geometry)
     assert got.dtype == dtype and got[0] == 0
     np.testing.assert_allclose(got, want, rtol=0, atol=VALUE[dtype.name] * np.max(np.abs(want)))
     for gradient in gradients[1:]:
@@ -162,7 +167,7 @@ def test_values_and_gradients_of_the_slice(dtype, rng):
     moves = [rng.normal(size=a.shape) for a in geometry]
     moves[3] -= np.sum(moves[3] * geometry[3], axis=1, keepdims=True) * geometry[3]
     with jax.enable_x64(True):
-        want = slopes(slices("float64"), geometry, weights, moves, 1e-5)
+        want = slopes(random("float64"), geometry, weights, moves, 1e-5)
     for name, *each in zip(("points", "position", "normal", "view"), gradients, moves, want, strict=True):
         check_slope(*each, dtype, name)
 
@@ -183,14 +188,14 @@ def test_hard_cases(name, dtype, rng):
     views = unit(rng.normal(size=(COUNT, 3)) * [1, 1, 0.3] + up)
     views[0] = up[0]
     weights = rng.normal(size=COUNT)
-    got, gradients = shade(slices(dtype.name), points, 0 * up, up, views, weights)
+    got, gradients = shade(random(dtype.name), points, 0 * up, up, views, weights)
     move = rng.normal(size=points.shape) * np.where(points[:, 2:] == 0, [1, 1, 0], 1) * (points[0, 2] or 1)
     turn, h, t = np.cross(rng.normal(size=views.shape), views), 1e-4, 1e-6
     integrals = lambda p: quadrature(lambda w, _: truth.scipy_basis(w, DEGREE), p, 0 * up[0], up[0], nodes=40)
     with jax.enable_x64(True):
         frame = local_outline(points, 0 * up[0], up[0])[1]
-        lobes = slices("float64")
-        c = lambda v: np.asarray(_slices(lobes, unit(v) @ frame.T))
+        slices = random("float64")
+        c = lambda v: np.asarray(_slices_at(slices, unit(v) @ frame.T))
         want = c(views) @ integrals(points)
         by_points = weights @ c(views) @ (integrals(points + h * move) - integrals(points - h * move)) / (2 * h)
         by_views = weights @ (c(views + t * turn) - c(views - t * turn)) @ integrals(points) / (2 * t)
@@ -202,7 +207,7 @@ def test_hard_cases(name, dtype, rng):
 def test_a_point_in_the_plane_of_the_light_is_dark():
     points = np.array([[1.0, -1, 0], [1, 1, 0], [2, 1, 0], [2, -1, 0]])
     up = np.tile([0.0, 0, 1], (COUNT, 1))
-    value, gradients = shade(slices("float32"), points, 0 * up, up, up)
+    value, gradients = shade(random("float32"), points, 0 * up, up, up)
     for x in (value, *gradients):
         np.testing.assert_array_equal(x, 0)
 
@@ -216,7 +221,7 @@ def test_far_from_the_origin(offset, rng):
     whole = np.array([[1, -1, 2], [-1, -1, 2], [-1, 1, 2], [1, 1, 2]])
     position = rng.integers(-2, 2, (COUNT, 3)) * [1, 1, 0]
     _, normal, view = scene(rng)
-    here, there = (shade(slices("float32"), whole + o, position + o, normal, view) for o in (np.zeros(3), offset))
+    here, there = (shade(random("float32"), whole + o, position + o, normal, view) for o in (np.zeros(3), offset))
     jax.tree.map(np.testing.assert_array_equal, there, here)
     # a small tilted lamp, as float32 holds it there; points beside it, some nearly in its plane
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -254,7 +259,7 @@ def test_projected_light_close_to_a_lamp(turn):
 
 def test_several_lights(rng):
     """Those of one kind in a loop, others beside them: the sum of what each adds, with their gradients."""
-    lobes, (position, normal, view) = slices("float32"), (a.astype(np.float32) for a in scene(rng))
+    slices, (position, normal, view) = random("float32"), (a.astype(np.float32) for a in scene(rng))
     quads = [(QUAD + 0.3 * rng.normal(size=3)).astype(np.float32) for _ in range(3)]
     emission, red = np.array([2.0, 0.5], np.float32), np.array([2.0, 0.0, 1.0], np.float32)
 
@@ -263,9 +268,9 @@ def test_several_lights(rng):
         seen = [models.PolygonLight(q, e) for q, e in zip(quads, emission, strict=False)]
         behind = models.PolygonLight(quads[0][::-1], 7.0)
         both = models.PolygonLight(quads[2][::-1], red, two_sided=True)
-        return shading.shade(lobes, [*seen, behind, both], shading.Surface(normal, view, position))
+        return shading.shade(slices, [*seen, behind, both], shading.Surface(normal, view, position))
 
-    (each, slopes) = zip(*(shade(lobes, q, position, normal, view) for q in quads), strict=True)
+    (each, slopes) = zip(*(shade(slices, q, position, normal, view) for q in quads), strict=True)
     value, pull = jax.vjp(total, quads, emission)
     want = emission @ each[:2]
     np.testing.assert_allclose(value, want[:, None] + each[2][:, None] * red, rtol=2e-6, atol=1e-7)
@@ -277,26 +282,25 @@ def test_several_lights(rng):
 
 
 def test_code_does_not_grow_with_lights_and_colours(rng):
-    surface = [a.astype(np.float32) for a in scene(rng)]
+    surface = surface_of(*scene(rng))
     quads = [(QUAD + i).astype(np.float32) for i in range(20)]
 
-    def size(lobes, count):
-        shade = lambda quads: shading.shade_polygon(lobes, [models.PolygonLight(q) for q in quads], *surface)
+    def size(slices, count):
+        shade = lambda quads: shading.shade(slices, [models.PolygonLight(q) for q in quads], surface)
         return len(jax.jit(shade).lower(quads[:count]).as_text().splitlines())
 
-    assert size(slices("float32"), 20) < 1.1 * size(slices("float32"), 2)
+    assert size(random("float32"), 20) < 1.1 * size(random("float32"), 2)
     one, rgb = (size(random_slices(2, np.dtype("float32"), c, domain="upper"), 1) for c in ((), (3,)))
     assert rgb < 1.1 * one
 
 
 def test_gradients_keep_no_tile_of_each_light(rng):
-    surface = [a.astype(np.float32) for a in scene(rng, 2048)]
+    surface = surface_of(*scene(rng, 2048))
     quads = np.stack([QUAD + i for i in range(20)]).astype(np.float32)
 
     def memory(count):
-        shade = lambda quads: shading.shade_polygon(
-            slices("float32"), [models.PolygonLight(q) for q in quads], *surface
-        ).sum()
+        lights = lambda quads: [models.PolygonLight(q) for q in quads]
+        shade = lambda quads: shading.shade(random("float32"), lights(quads), surface).sum()
         return jax.jit(jax.grad(shade)).lower(quads[:count]).compile().memory_analysis().temp_size_in_bytes
 
     assert memory(20) < 1.1 * memory(2)  # measured 1.00
@@ -304,19 +308,19 @@ def test_gradients_keep_no_tile_of_each_light(rng):
 
 def test_a_portal_is_the_light_behind_it(rng):
     """Several windows, and what changes with the light in their field; far away as at the origin."""
-    lobes, (position, normal, view) = slices("float32"), (np.round(64 * a) / 64 for a in scene(rng, 4))
+    slices, (position, normal, view) = random("float32"), (np.round(64 * a) / 64 for a in scene(rng, 4))
     quads, e = [np.round(64 * (QUAD + move)) / 64 for move in ([0, 0, 0], [0.25, 0.5, 0])], rng.normal(size=(2, 4))
     windows = [models.PortalLight(q.astype(np.float32), c.astype(np.float32)) for q, c in zip(quads, e, strict=True)]
 
     @jax.jit
     def shade(windows, position):
-        return jnp.sum(shading.shade_portal(lobes, windows, position, *surface), axis=0)
+        return jnp.sum(shading.shade(slices, windows, shading.Surface(*frame, position)), axis=0)
 
-    surface = [a.astype(np.float32) for a in (normal, view)]
+    frame = [a.astype(np.float32) for a in (normal, view)]
     both = jax.jit(jax.value_and_grad(shade))
     value, gradient = both(windows, position.astype(np.float32))
     light = lambda w: truth.scipy_basis(w, 1)
-    want = np.array([np.sum(expected_radiance(lobes, light, position, normal, view, q), axis=0) for q in quads])
+    want = np.array([np.sum(expected_radiance(slices, light, position, normal, view, q), axis=0) for q in quads])
     np.testing.assert_allclose(value, np.sum(want * e), rtol=1e-5)
     for window, term in zip(gradient, want, strict=True):
         np.testing.assert_allclose(window.coefficients, term, atol=1e-5 * np.max(np.abs(term)))
@@ -360,9 +364,8 @@ def test_radiance_of_the_material(name, bound, gain, dtype, rng):
         )
     assert 0 < np.sum(expected == 0) < 10
     rms = lambda got: np.sqrt(np.mean((np.asarray(got) - expected) ** 2) / np.mean(np.square(expected)))
-    light = models.PolygonLight(QUAD.astype(dtype))
-    arrays = [a.astype(dtype) for a in (position, normal, view)]
-    shade = lambda domain: shading.shade_polygon(lobes_of(name, 20, dtype.name, domain), light, *arrays)
+    light, surface = models.PolygonLight(QUAD.astype(dtype)), surface_of(position, normal, view, dtype)
+    shade = lambda domain: shading.shade(slices_of(name, 20, dtype.name, domain), light, surface)
     got = shade("upper")
     assert got.dtype == dtype and got[0] == 0
     assert rms(got) < bound, rms(got)
@@ -373,22 +376,20 @@ def test_radiance_of_the_material(name, bound, gain, dtype, rng):
 def test_light_by_direction(dtype, rng):
     """A profile at the light, and distant light through the same outline; in front, and from behind nothing."""
     position, normal, view = scene(rng, 6)
-    lobes, e = lobes_of("glossy", 4, dtype.name), rng.normal(size=(3, 16)).astype(dtype)
+    slices, e = slices_of("glossy", 4, dtype.name), rng.normal(size=(3, 16)).astype(dtype)
     tolerance = {"float64": 1e-12, "float32": 3e-5}[dtype.name]
-    points, arrays = QUAD.astype(dtype), [a.astype(dtype) for a in (position, normal, view)]
+    points, surface = QUAD.astype(dtype), surface_of(position, normal, view, dtype)
     portal = models.PortalLight(points, e)
     distant = lambda w: truth.scipy_basis(w, 3) @ e.astype(float).T
     leaving = lambda w: 0.7 * distant(-w)
     light = models.PolygonLight(points, np.asarray(0.7, dtype), profile=e)
-    for got, radiance in (
-        (shading.shade_portal(lobes, portal, *arrays), distant),
-        (shading.shade_polygon(lobes, light, *arrays), leaving),
-    ):
-        expected = expected_radiance(lobes, radiance, position, normal, view)
+    for one, radiance in ((portal, distant), (light, leaving)):
+        got = shading.shade(slices, one, surface)
+        expected = expected_radiance(slices, radiance, position, normal, view)
         assert got.dtype == dtype
         np.testing.assert_allclose(got, expected, atol=tolerance * np.max(np.abs(expected)))
     outside = models.PortalLight(points[::-1].copy(), e)
-    np.testing.assert_array_equal(shading.shade_portal(lobes, outside, *arrays), 0)
+    np.testing.assert_array_equal(shading.shade(slices, outside, surface), 0)
 
 
 @pytest.mark.slow
@@ -419,11 +420,11 @@ def test_projected_portals_and_wavelets(dtype, rng):
 @pytest.mark.slow
 def test_derivatives(x64, rng):
     position, normal, view = scene(rng, 4)
-    lobes = lobes_of("glossy", 4, "float64")
+    slices = slices_of("glossy", 4, "float64")
 
     def radiance(points, emission, position, normal, view):
         light = models.PolygonLight(points, emission)
-        return shading.shade(lobes, light, shading.Surface(normal, view, position))
+        return shading.shade(slices, light, shading.Surface(normal, view, position))
 
     arguments = (QUAD, np.asarray(1.3), position[1:], normal[1:], view[1:])
     check_grads(radiance, arguments, order=1, rtol=1e-6, atol=1e-8)
@@ -436,15 +437,15 @@ def test_derivatives(x64, rng):
 def test_derivatives_of_views_near_the_normal(sine, x64, rng):
     """Where the plane of incidence turns ever faster, on both sides of where its rule changes; in the material too."""
     position, normal, _ = scene(rng, 4)
-    lobes, azimuth = lobes_of("sharp", 6, "float64"), rng.uniform(0, 2 * np.pi, (4, 1))
+    slices, azimuth = slices_of("sharp", 6, "float64"), rng.uniform(0, 2 * np.pi, (4, 1))
     x = unit(np.cross(normal, [0.3, 0.5, -0.7]))
     view = normal + sine * (np.cos(azimuth) * x + np.sin(azimuth) * np.cross(normal, x))
 
     def radiance(coefficients, points, view, normal):
-        material = eqx.tree_at(lambda m: m.coefficients, lobes, jnp.asarray(coefficients))
+        material = eqx.tree_at(lambda m: m.coefficients, slices, jnp.asarray(coefficients))
         return shading.shade(material, models.PolygonLight(points), shading.Surface(normal[2:], view[2:], position[2:]))
 
-    arguments = (lobes.coefficients, QUAD, view, normal)
+    arguments = (slices.coefficients, QUAD, view, normal)
     for i, x in enumerate(arguments):  # a change of all coefficients is rough in the view: not both at a time
         only = lambda x, i=i: radiance(*arguments[:i], x, *arguments[i + 1 :])
         check_grads(only, (jnp.asarray(x),), order=1, rtol=1e-6, atol=1e-8)
@@ -453,27 +454,34 @@ def test_derivatives_of_views_near_the_normal(sine, x64, rng):
 @pytest.mark.slow
 def test_derivatives_of_portals(x64, rng):
     position, normal, view = (a[1:4] for a in scene(rng, 4))
-    lobes = lobes_of("glossy", 4, "float64")
-    shade = lambda points, e, *surface: shading.shade_portal(lobes, models.PortalLight(points, e), *surface)
+    slices = slices_of("glossy", 4, "float64")
+
+    def shade(points, e, position, normal, view):
+        return shading.shade(slices, models.PortalLight(points, e), shading.Surface(normal, view, position))
+
     check_grads(shade, (QUAD, rng.normal(size=9), position, normal, view), order=1, rtol=1e-6, atol=1e-8)
     project = lambda points, p: shading.project_light(models.PolygonLight(points), p, domains.HaarBasis(1))
     check_grads(project, (QUAD, position), order=1, rtol=1e-6, atol=1e-8, eps=1e-5)
 
 
 def test_bad_input_is_named(as_user):
-    lobes, up = slices("float32"), np.asarray([0, 0, 1], np.float32)
+    slices, up = random("float32"), np.asarray([0, 0, 1], np.float32)
     with pytest.raises(ValueError, match="fitted above the horizon"):
-        shading.shade(lobes, models.DistantLight(np.ones(9, np.float32)), shading.Surface(up, up))
-    with pytest.raises(ValueError, match="`light` must be"):
-        shading.shade(lobes, [], shading.Surface(up, up, up))
+        shading.shade(slices, models.DistantLight(np.ones(9, np.float32)), shading.Surface(up, up))
+    with pytest.raises(ValueError, match="`lights` is empty: pass at least one"):
+        shading.shade(slices, [], shading.Surface(up, up, up))
     with pytest.raises(ValueError, match="at least 3 points"):
         models.PolygonLight(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="`emission` must be"):
         models.PolygonLight(QUAD, np.ones((2, 3)))
     with pytest.raises(ValueError, match="`light` must be"):
         shading.project_light(QUAD, up, 2)
-    with pytest.raises(ValueError, match="`portal` must be a models.PortalLight"):
-        shading.shade(lobes, models.PolygonLight(QUAD), shading.Surface(up, up, up))
+    with pytest.raises(ValueError, match="`light` must be a models.PolygonLight or PortalLight; got SphereLight"):
+        shading.project_light(models.SphereLight(up, 0.5), up, 2)
+    with pytest.raises(ValueError, match="`lights` must be one of models.*PortalLight.*; got SphericalPolygon"):
+        shading.shade(slices, domains.SphericalPolygon(np.eye(3)), shading.Surface(up, up, up))
+    with pytest.raises(ValueError, match="`surface` needs `positions`"):
+        shading.shade(slices, models.PortalLight(QUAD, np.ones(4)), shading.Surface(up, up))
     with pytest.raises(ValueError, match="do not broadcast"):
         models.PolygonLight(QUAD, np.ones(2), profile=np.ones((3, 4)))
     with pytest.raises(ValueError, match="`domain` must be"):

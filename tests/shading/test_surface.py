@@ -1,4 +1,4 @@
-"""What holds for every verb: NaN stays NaN, masks, views on the horizon, and few sizes of compiled code."""
+"""What holds for all that shades: NaN stays NaN, masks, views on the horizon, and few sizes of compiled code."""
 
 import functools
 import logging
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shisd import models, shading
-from shisd.shading import _surface
+from shisd.shading import _tiles
 from tests.hard_cases import unit
 from tests.shading.slices import random_slices
 
@@ -20,23 +20,25 @@ sphere, upper = (functools.cache(functools.partial(random_slices, 1, FLOAT32, do
 
 
 @functools.cache
+def both():
+    return shading.Material(sphere(), upper())
+
+
+@functools.cache
 def brushed():
     c = np.array(sphere().coefficients)[:, None] * np.float32([1, 0.5, 0.8, 1.5])[None, :, None]
     return shading.Slices(c, isotropic=False)
 
 
-def of_positions(verb, light):
-    return lambda x, at, mask: verb(light(x), at["positions"], at["normals"], at["views"], mask=mask)
+def of(material, light=models.DistantLight):
+    return lambda x, at, mask: shading.shade(material(), light(x), shading.Surface(**at, mask=mask))
 
 
-def of_directions(verb):
-    return lambda x, at, mask: verb(x, at["normals"], at["views"], mask=mask)
-
-
-def mirror(verb):
+def mirror(**options):
     def shade(x, at, mask):
         axes = 0.1 * jnp.stack([at["along_columns"], at["along_rows"]], axis=-1)
-        return verb(shading.Footprint(at["directions"], axes), x, mask=mask)
+        footprint = shading.Footprint(at["directions"], axes)
+        return shading.reflect(footprint, models.DistantLight(x), mask=mask, **options)
 
     return shade
 
@@ -50,45 +52,32 @@ def matrix():
 FRAMES, LOCAL = ("normals", "views"), ("positions", "normals", "views")
 MIRROR = "directions", "along_columns", "along_rows"
 HARMONICS = np.float32([1, 0.3, -0.2, 0.5])
-ANISOTROPIC = functools.partial(shading.shade_mirror, anisotropic=True)
+SEEN = np.tile(HARMONICS, (COUNT, 1))
+
+
+@functools.cache
+def mesh():
+    return models.Visibility(SEEN * np.float32([[1], [0.5], [2], [0.8]]), np.array([[0, 1, 2], [1, 2, 3]]))
+
+
+def on_mesh(x, at, mask):
+    places = {"triangles": jnp.where(mask, 1, -1), "barycentric": at["barycentric"]}
+    light = models.Occluded(models.DistantLight(x), mesh())
+    return shading.shade(sphere(), light, shading.Surface(at["normals"], at["views"], mask=mask, **places))
+
+
 EACH = {  # what shades, its light, and which arrays of points it takes
-    "environment": (of_directions(lambda *a, **k: shading.shade_environment(sphere(), *a, **k)), HARMONICS, FRAMES),
-    "brushed": (
-        lambda x, at, mask: shading.shade(
-            brushed(), models.DistantLight(x), shading.Surface(at["normals"], at["views"], at["tangents"], mask=mask)
-        ),
-        HARMONICS,
-        (*FRAMES, "tangents"),
-    ),
-    "matrix": (of_directions(lambda *a, **k: shading.shade_matrix(matrix(), *a, **k)), HARMONICS, FRAMES),
-    "zonal": (
-        of_directions(lambda x, *a, **k: shading.shade_zonal(sphere(), x, HARMONICS[:2], *a, **k)),
-        HARMONICS[:3],
-        FRAMES,
-    ),
-    "visibility": (
-        of_directions(
-            lambda x, *a, **k: shading.shade_environment_visibility(
-                sphere(), x, np.tile(HARMONICS, (COUNT, 1)), *a, **k
-            )
-        ),
-        HARMONICS,
-        FRAMES,
-    ),
-    "sphere": (
-        of_positions(lambda *a, **k: shading.shade_sphere(sphere(), *a, **k), lambda x: models.SphereLight(x, 0.5)),
-        np.float32([0.2, 0.3, 2]),
-        LOCAL,
-    ),
-    "polygon": (
-        of_positions(lambda *a, **k: shading.shade_polygon(upper(), *a, **k), models.PolygonLight),
-        SQUARE,
-        LOCAL,
-    ),
-    "portal": (
-        of_positions(
-            lambda *a, **k: shading.shade_portal(upper(), *a, **k), lambda x: models.PortalLight(x, HARMONICS)
-        ),
+    "environment": (of(sphere), HARMONICS, FRAMES),
+    "brushed": (of(brushed), HARMONICS, (*FRAMES, "tangents")),
+    "matrix": (of(matrix), HARMONICS, FRAMES),
+    "zonal": (of(sphere, lambda x: models.ZonalLight(x, HARMONICS[:2])), HARMONICS[:3], FRAMES),
+    "visibility": (of(sphere, lambda x: models.Occluded(models.DistantLight(x), SEEN)), HARMONICS, FRAMES),
+    "mesh": (on_mesh, HARMONICS, (*FRAMES, "barycentric")),
+    "sphere": (of(sphere, lambda x: models.SphereLight(x, 0.5)), np.float32([0.2, 0.3, 2]), LOCAL),
+    "polygon": (of(upper, models.PolygonLight), SQUARE, LOCAL),
+    "portal": (of(upper, lambda x: models.PortalLight(x, HARMONICS)), SQUARE, LOCAL),
+    "several": (
+        of(both, lambda x: [models.PolygonLight(x), models.DistantLight(HARMONICS), models.SphereLight(x[0], 0.5)]),
         SQUARE,
         LOCAL,
     ),
@@ -97,24 +86,24 @@ EACH = {  # what shades, its light, and which arrays of points it takes
         SQUARE,
         LOCAL[:1],
     ),
-    "mirror": (mirror(shading.shade_mirror), HARMONICS, MIRROR),
-    "anisotropic mirror": (mirror(ANISOTROPIC), HARMONICS, MIRROR),
+    "mirror": (mirror(), HARMONICS, MIRROR),
+    "anisotropic mirror": (mirror(anisotropic=True), HARMONICS, MIRROR),
 }
 
 
 @functools.cache
 def compiled(name):
     """Values and gradients of their sum, by light and points."""
-    verb = EACH[name][0]
-    for material in (sphere, upper, brushed, matrix):
+    function = EACH[name][0]
+    for material in (sphere, upper, both, brushed, matrix, mesh):
         material()  # outside of the trace, for all to keep
 
     @jax.jit
-    def both(light, points, mask):
-        value, pull = jax.vjp(lambda light, points: verb(light, points, mask), light, points)
+    def value_and_gradients(light, points, mask):
+        value, pull = jax.vjp(lambda light, points: function(light, points, mask), light, points)
         return value, pull(jnp.ones_like(value))
 
-    return both
+    return value_and_gradients
 
 
 def shade(name, light, points, mask=None):
@@ -128,6 +117,7 @@ def some_points(rng):
     points["normals"] = 2 * unit(0.3 * rng.normal(size=(COUNT, 3)) + [0, 0, 1])
     points["views"] = unit(points["normals"] + 0.8 * rng.normal(size=(COUNT, 3)))
     points["positions"] = 0.3 * rng.normal(size=(COUNT, 3))
+    points["barycentric"] = rng.dirichlet(np.ones(3), size=COUNT)
     return {k: x.astype(np.float32) for k, x in points.items()}
 
 
@@ -208,7 +198,7 @@ def test_a_new_number_of_points_compiles_nothing_heavy(caplog, rng):
 
 
 def test_batches_are_filled_up_to_few_sizes():
-    sizes = [_surface._filled(n) for n in range(1 << 13)]
+    sizes = [_tiles._filled(n) for n in range(1 << 13)]
     assert all(n <= s for n, s in enumerate(sizes)) and len(set(sizes)) == 1 + 7 + 8 * 7
     assert max(s / n for n, s in enumerate(sizes[65:], 65)) < 9 / 8
 

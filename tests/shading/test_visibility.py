@@ -14,7 +14,7 @@ from tests.marks import FLOAT32_FIRST
 from tests.shading.slices import random_slices
 from tests.truth import scipy_basis
 
-LOBES, LIGHT, SEEN = 5, 7, 4  # degrees
+SLICES, LIGHT, SEEN = 5, 7, 4  # degrees
 NODE = 3  # the elevation at which views look, whose slice the table holds as it is
 VIEW = np.array([np.sin(_views.elevations(8)[NODE]), 0, np.cos(_views.elevations(8)[NODE])])
 
@@ -22,12 +22,17 @@ VIEW = np.array([np.sin(_views.elevations(8)[NODE]), 0, np.cos(_views.elevations
 def scene(rng, dtype, count=5, vertices=6):
     """A light, visibility on a few triangles, and points on them, each in a frame of its own."""
     e = rng.normal(size=(3, (LIGHT + 1) ** 2))
-    triangles = rng.integers(0, vertices, size=(4, 3))
-    seen = models.Visibility(rng.normal(size=(vertices, (SEEN + 1) ** 2)).astype(dtype), triangles)
-    triangle, weights = rng.integers(0, 4, size=count), rng.dirichlet(np.ones(3), size=count)
+    corners = rng.integers(0, vertices, size=(4, 3))
+    seen = models.Visibility(rng.normal(size=(vertices, (SEEN + 1) ** 2)).astype(dtype), corners)
+    triangles, barycentric = rng.integers(0, 4, size=count), rng.dirichlet(np.ones(3), size=count)
     frames = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     frames *= np.linalg.det(frames)[:, None, None]
-    return e.astype(dtype), seen, triangle, weights.astype(dtype), frames
+    return e.astype(dtype), seen, {"triangles": triangles, "barycentric": barycentric.astype(dtype)}, frames
+
+
+def shade(slices, e, seen, normals, views, **at):
+    """Radiance from distant light that is seen in part."""
+    return shading.shade(slices, models.Occluded(models.DistantLight(e), seen), shading.Surface(normals, views, **at))
 
 
 def quadrature(c, e, v, frame):
@@ -38,74 +43,75 @@ def quadrature(c, e, v, frame):
     points = np.stack([np.outer(sine, np.cos(phi)), np.outer(sine, np.sin(phi)), np.outer(x, np.ones(24))], axis=-1)
     points, area = points.reshape(-1, 3), np.repeat(w, 24) * 2 * np.pi / 24
     v, e = scipy_basis(points, SEEN) @ v, scipy_basis(points, LIGHT) @ e.T
-    return (area * v * (scipy_basis(points @ frame, LOBES) @ c)) @ e
+    return (area * v * (scipy_basis(points @ frame, SLICES) @ c)) @ e
 
 
 @FLOAT32_FIRST
 def test_it_is_the_integral_of_the_three_expansions(dtype, rng):
-    lobes = random_slices(LOBES, dtype)
-    e, seen, triangle, weights, frames = scene(rng, dtype)
+    slices = random_slices(SLICES, dtype)
+    e, seen, at, frames = scene(rng, dtype)
     normals, views = frames[:, :, 2].astype(dtype), (frames @ VIEW).astype(dtype)
-    got = shading.shade(
-        lobes,
-        models.Occluded(models.DistantLight(e), seen),
-        shading.Surface(normals, views, triangles=triangle, barycentric=weights),
-    )
-    c, v = np.asarray(lobes.coefficients[NODE], float), np.asarray(seen.coefficients, float)
-    between = np.einsum("pc,pcn->pn", weights, v[np.asarray(seen.triangles)[triangle]])
+    got = shade(slices, e, seen, normals, views, **at)
+    c, v = np.asarray(slices.coefficients[NODE], float), np.asarray(seen.coefficients, float)
+    between = np.einsum("pc,pcn->pn", at["barycentric"], v[np.asarray(seen.triangles)[at["triangles"]]])
     expected = np.stack([quadrature(c, e.astype(float), *x) for x in zip(between, frames, strict=True)])
     assert got.dtype == dtype and got.shape == (5, 3)
     tolerance = (1e-5 if dtype == np.float32 else 1e-12) * np.max(np.abs(expected))
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance)
-    points = models.Visibility(seen.at(triangle, weights), np.zeros((0, 3), int))
-    each = shading.shade(lobes, models.Occluded(models.DistantLight(e), points), shading.Surface(normals, views))
+    points = models.Visibility(seen.at(**at), np.zeros((0, 3), int))
+    each = shade(slices, e, points, normals, views)
     np.testing.assert_allclose(each, expected, rtol=0, atol=tolerance)
-    one = shading.shade(
-        lobes,
-        models.Occluded(models.DistantLight(e[0]), seen.at(triangle, weights)[1]),
-        shading.Surface(normals, views),
-    )
+    one = shade(slices, e[0], seen.at(**at)[1], normals, views)
     np.testing.assert_allclose(one[1], expected[1, 0], rtol=0, atol=tolerance)
 
 
 @pytest.mark.slow
 def test_the_triple_product_and_the_shader_of_the_paper_agree(x64, rng):
-    lobes = random_slices(LOBES, np.float64)
-    e, seen, triangle, weights, frames = scene(rng, np.float64, count=2)
+    slices = random_slices(SLICES, np.float64)
+    e, seen, at, frames = scene(rng, np.float64, count=2)
     normals, views = frames[:, :, 2], frames @ VIEW
-    got = shading.shade(
-        lobes,
-        models.Occluded(models.DistantLight(e), seen),
-        shading.Surface(normals, views, triangles=triangle, barycentric=weights),
-    )
-    v = seen.at(triangle, weights)
-    product = harmonics.multiply(e[None], v[:, None], LOBES)
+    got = shade(slices, e, seen, normals, views, **at)
+    v = seen.at(**at)
+    product = harmonics.multiply(e[None], v[:, None], SLICES)
     for i in range(2):
-        direct = shading.shade(lobes, models.DistantLight(product[i]), shading.Surface(normals[i], views[i]))
+        direct = shading.shade(slices, models.DistantLight(product[i]), shading.Surface(normals[i], views[i]))
         np.testing.assert_allclose(got[i], direct, rtol=1e-11)
     # appendix A: rho = slice in the world, s = gamma rho, radiance = sum of s pi_l (v * y_l^0)(z_k)
-    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(LOBES), LOBES)
-    gamma = shading.visibility_gamma(e, basis, LOBES)
-    rho = harmonics.rotate(lobes.coefficients[NODE], frames[0])
+    basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(SLICES), SLICES)
+    gamma = shading.visibility_gamma(models.DistantLight(e), basis, SLICES)
+    rho = harmonics.rotate(slices.coefficients[NODE], frames[0])
     s = jnp.einsum("cnlk,n->clk", gamma, rho)
-    l = np.arange(LOBES + 1)
-    kept = jnp.zeros((LOBES + 1) ** 2).at[: (SEEN + 1) ** 2].set(v[0])
-    y, band = scipy_basis(np.asarray(basis.directions), LOBES), lambda k: slice(k * k, (k + 1) ** 2)
+    l = np.arange(SLICES + 1)
+    kept = jnp.zeros((SLICES + 1) ** 2).at[: (SEEN + 1) ** 2].set(v[0])
+    y, band = scipy_basis(np.asarray(basis.directions), SLICES), lambda k: slice(k * k, (k + 1) ** 2)
     seen_along = np.stack([np.sqrt(4 * np.pi / (2 * k + 1)) * y[:, band(k)] @ np.asarray(kept[band(k)]) for k in l])
     np.testing.assert_allclose(got[0], jnp.einsum("clk,lk->c", s, seen_along), rtol=1e-10)
 
 
+def test_the_background_lies_on_no_triangle(rng):
+    """What a mask leaves out, and a triangle that many points share."""
+    slices, (e, seen, at, frames) = random_slices(SLICES, np.dtype("float32")), scene(rng, np.float32)
+    normals, views = frames[:, :, 2].astype(np.float32), (frames @ VIEW).astype(np.float32)
+    there, one = np.array([True, False, True, True, False]), np.full(5, 2)
+    shared = np.asarray(shade(slices, e, seen, normals, views, triangles=one, barycentric=at["barycentric"]))
+    for triangles in (np.where(there, 2, -1), np.where(there, 2, 4)):
+        got = shade(slices, e, seen, normals, views, mask=there, triangles=triangles, barycentric=at["barycentric"])
+        np.testing.assert_array_equal(got, np.where(there[:, None], shared, 0))
+    got = shade(slices, e, seen, normals, views, triangles=2, barycentric=at["barycentric"])
+    np.testing.assert_array_equal(got, shared)
+
+
 @FLOAT32_FIRST
 def test_nothing_hidden_is_the_environment_and_everything_is_dark(dtype, rng):
-    lobes = random_slices(LOBES, dtype)
-    e, _, _, _, frames = scene(rng, dtype)
+    slices = random_slices(SLICES, dtype)
+    e, _, _, frames = scene(rng, dtype)
     normals, views = frames[:, :, 2].astype(dtype), (frames @ VIEW).astype(dtype)
     caps = np.asarray(models.cap_visibility(np.array([0, 0, 1], dtype), np.array([0, np.pi], dtype), SEEN))
-    expected = np.asarray(shading.shade(lobes, models.DistantLight(e), shading.Surface(normals, views)))
+    expected = np.asarray(shading.shade(slices, models.DistantLight(e), shading.Surface(normals, views)))
     tolerance = (1e-5 if dtype == np.float32 else 1e-12) * np.max(np.abs(expected))
     for v, right in zip(caps, (expected, 0 * expected), strict=True):
         for each in (v, np.tile(v, (5, 1))):  # of all points, and a row for every point: two ways
-            got = shading.shade(lobes, models.Occluded(models.DistantLight(e), each), shading.Surface(normals, views))
+            got = shade(slices, e, each, normals, views)
             np.testing.assert_allclose(got, right, rtol=0, atol=tolerance)
 
 
@@ -122,20 +128,16 @@ def test_caps_are_integrals_over_what_they_leave(dtype):
 
 @pytest.mark.slow
 def test_derivatives(x64, rng):
-    lobes = random_slices(LOBES, np.float64)
-    e, seen, triangle, weights, frames = scene(rng, np.float64, count=3)
+    slices = random_slices(SLICES, np.float64)
+    e, seen, at, frames = scene(rng, np.float64, count=3)
     normals, views = frames[:, :, 2], frames @ VIEW
     views[0] = normals[0]
 
-    def radiance(light, coefficients, weights, normals, views):
+    def radiance(light, coefficients, barycentric, normals, views):
         v = models.Visibility(coefficients, seen.triangles)
-        return shading.shade(
-            lobes,
-            models.Occluded(models.DistantLight(light), v),
-            shading.Surface(normals, views, triangles=triangle, barycentric=weights),
-        )
+        return shade(slices, light, v, normals, views, triangles=at["triangles"], barycentric=barycentric)
 
-    arguments = tuple(jnp.asarray(a) for a in (e, seen.coefficients, weights, normals, views))
+    arguments = tuple(jnp.asarray(a) for a in (e, seen.coefficients, at["barycentric"], normals, views))
     check_grads(jax.jit(radiance), arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
 
 
@@ -291,8 +293,10 @@ def test_triangles_that_do_not_exist_are_errors_or_nan():
     c = np.arange(16, dtype=np.float32).reshape(4, 4)
     seen, w = models.Visibility(c, np.array([[0, 1, 2], [1, 2, 3]])), np.array([0.5, 0.25, 0.25], np.float32)
     for index in (7, -1, 2):
-        with pytest.raises(ValueError, match=f"`triangle` must be in 0 to 1, for 2 triangles; got {index} to {index}"):
+        with pytest.raises(ValueError, match=f"`triangles` must be in 0 to 1, for 2 triangles; got {index} to {index}"):
             seen.at(index, w)
+    with pytest.raises(ValueError, match=r"`triangles` must be integers of the batch shape of `barycentric` \[3\]"):
+        seen.at(np.array([0, 1]), w)
     at = np.asarray(jax.jit(jax.vmap(lambda i: seen.at(i, w)))(np.array([7, -1, 2, 1])))
     np.testing.assert_array_equal(np.isnan(at), np.array([[True], [True], [True], [False]]) & np.ones((4, 4), bool))
     np.testing.assert_array_equal(at[3], w @ c[1:])
@@ -334,21 +338,28 @@ def test_errors_name_the_argument(as_user, rng):
     for offset in (-1.0, np.nan, np.inf, [0.1]):
         with pytest.raises(ValueError, match="`offset` must be a number >= 0"):
             make(points, faces, 3, offset=offset)
-    lobes = random_slices(LOBES, np.float32)
-    e, seen, triangle, weights, frames = scene(rng, np.float32)
+    slices = random_slices(SLICES, np.float32)
+    e, seen, at, frames = scene(rng, np.float32)
     n = frames[:, :, 2].astype(np.float32)
-    shade = lambda v, **at: shading.shade_environment_visibility(lobes, e, v, n, n, **at)
-    with pytest.raises(ValueError, match=r"`triangle` \[...\] and `weights` \[..., 3\] are needed"):
-        shade(seen)
-    with pytest.raises(ValueError, match="belong to a models.Visibility"):
-        shade(seen.coefficients[0], weights=weights)
-    with pytest.raises(ValueError, match="`triangle` must be integers; got float64"):
-        shade(seen, triangle=triangle.astype(float), weights=weights)
-    with pytest.raises(ValueError, match="`triangle` must be integers of the batch shape"):
-        shade(seen, triangle=triangle[:3], weights=weights)
-    with pytest.raises(ValueError, match="`triangle` must be in 0 to 3, for 4 triangles; got 7 to 7"):
-        shade(seen, triangle=0 * triangle + 7, weights=weights)
+    bad = lambda v, **changed: shade(slices, e, v, n, n, **changed)
+    with pytest.raises(ValueError, match=r"`surface` needs `triangles` \[...\] and `barycentric` \[..., 3\]: .* mesh"):
+        bad(seen)
+    for name in at:
+        with pytest.raises(ValueError, match="belong together: pass both or none"):
+            bad(seen, **{name: at[name]})
+    with pytest.raises(ValueError, match="`triangles` must be integers .*; got dtype float"):
+        bad(seen, **at | {"triangles": at["triangles"].astype(np.float32)})
+    with pytest.raises(ValueError, match=r"do not broadcast: .* `triangles` \[3\]"):
+        bad(seen, **at | {"triangles": at["triangles"][:3]})
+    with pytest.raises(ValueError, match="`triangles` must be in 0 to 3, for 4 triangles; got 7 to 7"):
+        bad(seen, **at | {"triangles": 0 * at["triangles"] + 7})
     with pytest.raises(ValueError, match=r"`visibility` must have \(degree \+ 1\)\*\*2 coefficients"):
-        shade(np.ones(5))
+        bad(np.ones(5))
     with pytest.raises(ValueError, match="do not broadcast"):
-        shade(np.ones((4, 9), np.float32))
+        bad(np.ones((4, 9), np.float32))
+    with pytest.raises(
+        ValueError, match="`light` must be a models.DistantLight or ZonalLight, which alone can be occl"
+    ):
+        models.Occluded(models.SphereLight(np.ones(3), 0.5), seen)
+    with pytest.raises(ValueError, match="`light` must be a models.DistantLight; got"):
+        shading.visibility_gamma(e, decomposition.RotatedZonalBasis(decomposition.optimized_directions(2), 2), 2)

@@ -22,6 +22,10 @@ def tabulate(material):
     return shading.tabulate_brdf(MATERIALS[material](), DEGREE, elevations=16, azimuths=16)
 
 
+def shade(slices, light, normals, views, tangents=None):
+    return shading.shade(slices, light, shading.Surface(normals, views, tangents=tangents))
+
+
 def scene(rng, count, dtype):
     normals, views, tangents = unit(rng.normal(size=(3, count, 3)))
     views *= np.where(np.sum(views * normals, axis=1) < 0, -1, 1)[:, None]
@@ -32,63 +36,62 @@ def scene(rng, count, dtype):
 @FLOAT32_FIRST
 @pytest.mark.parametrize("material", ["smooth", *(pytest.param(m, marks=pytest.mark.slow) for m in MATERIALS)])
 def test_it_is_the_light_of_these_coefficients(material, dtype, rng):
-    lobes = random_slices(DEGREE, dtype) if material == "smooth" else tabulate(material)
+    slices = random_slices(DEGREE, dtype) if material == "smooth" else tabulate(material)
     axis, z, *where = scene(rng, 200, dtype)
     where[1][0], where[0][1] = where[0][0], axis  # a view along the normal, a normal along the axis
     e = harmonics.convolve(harmonics.sh_basis(axis, DEGREE)[None], z)
-    expected = shading.shade_environment(lobes, e, *where)
-    got = shading.shade_zonal(lobes, axis, z, *where)
+    expected = shade(slices, models.DistantLight(e), *where)
+    got = shade(slices, models.ZonalLight(axis, z), *where)
     assert got.dtype == dtype and got.shape == (200, 3)
-    np.testing.assert_allclose(got, expected, atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)))
-    low = shading.shade_zonal(lobes, axis, z[0, :3], *where)
-    np.testing.assert_allclose(
-        low,
-        shading.shade_environment(lobes, e[0, :9], *where),
-        atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)),
-    )
+    bound = 3e-6 if dtype == np.float32 else 1e-13
+    np.testing.assert_allclose(got, expected, atol=bound * np.max(np.abs(expected)))
+    low = shade(slices, models.ZonalLight(axis, z[0, :3]), *where)
+    of_low = shade(slices, models.DistantLight(e[0, :9]), *where)
+    np.testing.assert_allclose(low, of_low, atol=bound * np.max(np.abs(expected)))
+    distant = models.ZonalLight(axis, z).distant()
+    np.testing.assert_allclose(distant.coefficients, e, atol=bound * np.max(np.abs(e)))
 
 
 @FLOAT32_FIRST
 def test_several_lights_add_up(dtype, rng):
-    lobes = random_slices(DEGREE, dtype)
+    slices = random_slices(DEGREE, dtype)
     axis, z, normals, views, _ = scene(rng, 20, dtype)
-    axes, each = np.stack([axis, -axis[::-1]]), np.stack([z, z[::-1]])
-    got = shading.shade(lobes, models.ZonalLight(axes, each), shading.Surface(normals, views))
-    one = lambda axis, z: np.asarray(shading.shade(lobes, models.ZonalLight(axis, z), shading.Surface(normals, views)))
-    expected = one(axes[0], each[0]) + one(axes[1], each[1])
+    lights = [models.ZonalLight(axis, z), models.ZonalLight(-axis[::-1], z[::-1])]
+    got = shade(slices, lights, normals, views)
+    expected = sum(np.asarray(shade(slices, light, normals, views)) for light in lights)
     np.testing.assert_allclose(got, expected, atol=(3e-6 if dtype == np.float32 else 1e-13) * np.max(np.abs(expected)))
 
 
 def test_eq_24(x64, rng):
-    lobes = random_slices(DEGREE, np.float64)
+    slices = random_slices(DEGREE, np.float64)
     basis = decomposition.RotatedZonalBasis(decomposition.optimized_directions(DEGREE), DEGREE)
     axis, z, normals, views, _ = scene(rng, 6, np.float64)
-    got = shading.shade(lobes, models.ZonalLight(axis, z[0]), shading.Surface(normals, views))
+    got = shade(slices, models.ZonalLight(axis, z[0]), normals, views)
     # the sum over rotated axes as it stands: view in the x-z plane of each frame, z_l times Legendre series
     for normal, view, value in zip(normals, views, got, strict=True):
         x = unit(view - (view @ normal) * normal)
         world = basis.directions @ np.stack([x, np.cross(normal, x), normal])
         p = np.polynomial.legendre.legvander(np.asarray(world) @ unit(axis), DEGREE)  # y_l^0 pi_l = P_l
-        weights = basis.weights(lobes.at(jnp.array([np.sqrt(1 - (view @ normal) ** 2), 0, view @ normal])))
+        weights = basis.weights(slices.at(jnp.array([np.sqrt(1 - (view @ normal) ** 2), 0, view @ normal])))
         np.testing.assert_allclose(value, np.sum(np.asarray(weights) * z[0][:, None] * p.T), rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_derivatives(x64, rng):
-    lobes = tabulate("glossy")
+    slices = tabulate("glossy")
     arguments = tuple(jnp.asarray(a) for a in scene(rng, 3, np.float64)[:4])
-    radiance = jax.jit(lambda *a: shading.shade_zonal(lobes, *a))
+    radiance = jax.jit(lambda axis, z, *a: shade(slices, models.ZonalLight(axis, z), *a))
     check_grads(radiance, arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
 
 
 def test_errors_name_the_argument(as_user, rng):
     axis, z, normals, views, _ = scene(rng, 2, np.float32)
-    lobes = random_slices(DEGREE, np.float32)
-    with pytest.raises(ValueError, match=r"`axis` must have shape \[3\], or \[S, 3\] for S lights; got \[1, 1, 3\]"):
-        shading.shade(lobes, models.ZonalLight(axis[None, None], z), shading.Surface(normals, views))
-    with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape \[L\+1\]"):
-        shading.shade(lobes, models.ZonalLight(axis, z[None]), shading.Surface(normals, views))
-    with pytest.raises(ValueError, match=r"`zonal_coefficients` must have shape \[1, L\+1\] or \[1, colour, L\+1\]"):
-        shading.shade(lobes, models.ZonalLight(axis[None], z[0]), shading.Surface(normals, views))
-    with pytest.raises(ValueError, match="`material` must come from shading.tabulate_brdf"):
-        shading.shade(1, models.ZonalLight(axis, z), shading.Surface(normals, views))
+    message = r"`axis` must have shape \[3\]; got \[2, 3\]\. Pass a list of lights for several\."
+    with pytest.raises(ValueError, match=message):
+        models.ZonalLight(np.stack([axis, axis]), z)
+    for wrong in (z[None], z[0, 0], z[:, :0]):
+        message = r"`coefficients` must have shape \[L\+1\] or \[colour, L\+1\]; got \[.*\]\."
+        with pytest.raises(ValueError, match=message):
+            models.ZonalLight(axis, wrong)
+    with pytest.raises(ValueError, match="`material` must come from shading.prepare, tabulate_brdf or project_brdf"):
+        shade(1, models.ZonalLight(axis, z), normals, views)

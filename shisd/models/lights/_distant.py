@@ -67,5 +67,5 @@ class ZonalLight(Module):
 
     def distant(self) -> DistantLight:
         """The same light with all its harmonics, pi_l z_l y_l^m(axis) with pi_l = sqrt(4 pi / (2l+1)) (Eq. 24)."""
-        z = self.coefficients / jnp.asarray(zonal_norms(self.degree), self.axis.dtype)
+        z = times(self.coefficients, jnp.asarray(1 / zonal_norms(self.degree), self.axis.dtype))
         return DistantLight(times(z[..., bands(self.degree)], sh_basis(normalize(self.axis), self.degree)))

@@ -7,7 +7,7 @@ mirror image of what is seen from outside, and there regions are positive when c
 and their product is right on either side. `outline` turns the points round instead.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
 
@@ -18,6 +18,7 @@ from shisd.domains import SphericalPolygon, polygon_from_points
 from shisd.domains.internal import Loop
 
 
+@runtime_checkable
 class Flat(Protocol):
     """A polygon in space that lights one side, or both."""
 
@@ -49,7 +50,7 @@ def outline(light: Flat, origin: ArrayLike) -> SphericalPolygon:
     dtype = jnp.promote_types(o.dtype, light.points.dtype)
     points, o = light.points.astype(dtype), o.astype(dtype)
     side = facing(light, (points - o[None]).T[..., None])
-    dark = jnp.broadcast_to(points[:1], points.shape)
+    dark = jnp.where(side == 0, jnp.broadcast_to(points[:1], points.shape), jnp.nan)
     return polygon_from_points(jnp.where(side < 0, points[::-1], jnp.where(side > 0, points, dark)), o)
 
 

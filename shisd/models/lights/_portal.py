@@ -1,7 +1,5 @@
 """Windows through which distant light is seen."""
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 
 from shisd import _checks
@@ -20,12 +18,15 @@ class PortalLight(Module):
 
     points: Float[Array, "s 3"]
     coefficients: Float[Array, "*colour_n"]
-    two_sided: ClassVar[bool] = False
 
     def __init__(self, points: ArrayLike, coefficients: ArrayLike):
         p, (c, _) = _checks.outline("points", points), _checks.expansion("coefficients", coefficients)
         dtype = jnp.promote_types(p.dtype, c.dtype)
         self.points, self.coefficients = p.astype(dtype), c.astype(dtype)
+
+    @property
+    def two_sided(self) -> bool:
+        return False
 
     @property
     def colour(self) -> tuple[int, ...]:

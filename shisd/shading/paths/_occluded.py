@@ -61,7 +61,9 @@ def _one(slices: Slices, light: Occluded, points: dict[str, Array], surface: Sur
             raise ValueError(
                 "`surface` needs `triangles` [...] and `barycentric` [..., 3]: `visibility` is that of a mesh."
             )
-        corners, barycentric = surface_corners(visibility, surface.triangles, surface.barycentric)
+        corners, barycentric = surface_corners(
+            visibility, *_places(surface.triangles, surface.barycentric, surface.mask)
+        )
         own, v = {"corners": corners, "barycentric": barycentric}, visibility.coefficients
     elif visibility.ndim == 1:
         visible = DistantLight(multiply(distant.coefficients, visibility, slices.degree))
@@ -75,6 +77,16 @@ def _one(slices: Slices, light: Occluded, points: dict[str, Array], surface: Sur
 
 def _distant_light(light: DistantLight | ZonalLight) -> DistantLight:
     return light.distant() if isinstance(light, ZonalLight) else light
+
+
+def _places(triangles: Array, barycentric: Array, mask: Array | None) -> tuple[Array, Array]:
+    """Places of points on a mesh, of one batch shape; in the first triangle where there is no surface."""
+    masked = () if mask is None else mask.shape
+    batch = np.broadcast_shapes(triangles.shape, barycentric.shape[:-1], masked)
+    index = jnp.broadcast_to(triangles, batch)
+    if mask is not None:
+        index = jnp.where(jnp.broadcast_to(mask, batch), index, 0)
+    return index, jnp.broadcast_to(barycentric, (*batch, 3))
 
 
 def visibility_gamma(light: DistantLight, basis: RotatedZonalBasis, degree: int) -> Float[Array, "*c n l k"]:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,8 +13,9 @@ from shisd._methods import method
 from shisd._module import Module
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics.internal import bands, orders, rows
+from shisd.harmonics.internal import bands, orders, place, rows
 from shisd.shading import _views
+from shisd.shading.slices import _energies
 from shisd.shading.slices._upper import RIDGE, fit_above
 
 
@@ -22,14 +24,14 @@ class Slices(Module):
 
     Arguments: `coefficients` [*colour, V, (L+1)^2] for isotropic materials, in views at elevations (j + 1/2) (pi/2)/V
     from the normal and azimuth 0 (the slice of azimuth phi is this one turned by phi); [*colour, V, A, (L+1)^2] for
-    anisotropic ones (static `isotropic` False), with azimuths 2 pi i/A. `quadrature_error`: that of the slices,
+    anisotropic ones (static `isotropic` False), with azimuths 2 pi i/A. `error`: that of the quadrature of the slices,
     estimated, relative to their RMS over the picture of a sphere (see `tabulate_brdf`). Static `domain`: where the
     slices stand for the material, everywhere ("sphere") or only above the horizon ("upper").
     As rotated zonal harmonics: `weights` and `from_weights`.
     """
 
     coefficients: Float[Array, "*colour_views n"]
-    quadrature_error: Scalar
+    error: Scalar
     isotropic: bool = eqx.field(static=True)
     domain: Literal["sphere", "upper"] = eqx.field(static=True)
 
@@ -37,7 +39,7 @@ class Slices(Module):
         self,
         coefficients: ArrayLike,
         *,
-        quadrature_error: ArrayLike = 0.0,
+        error: ArrayLike = 0.0,
         isotropic: bool = True,
         domain: Literal["sphere", "upper"] = "sphere",
     ):
@@ -48,7 +50,7 @@ class Slices(Module):
             raise ValueError(f"`coefficients` must have shape [{form}, n] or [colour, {form}, n]; got {list(c.shape)}.")
         check_domain(domain)
         self.coefficients, self.isotropic, self.domain = c, bool(isotropic), domain
-        self.quadrature_error = jnp.asarray(quadrature_error, c.dtype)
+        self.error = jnp.asarray(error, c.dtype)
 
     @property
     def degree(self) -> int:
@@ -85,7 +87,42 @@ class Slices(Module):
         return self._with(fit_above(self.coefficients, ridge), "upper")
 
     def _with(self, coefficients: Array, domain: Literal["sphere", "upper"]) -> "Slices":
-        return Slices(coefficients, quadrature_error=self.quadrature_error, isotropic=self.isotropic, domain=domain)
+        return Slices(coefficients, error=self.error, isotropic=self.isotropic, domain=domain)
+
+    @method
+    def energies(self) -> Float[Array, "*colour_views l"]:
+        """Energies of the bands, in 1/sr: the squared norm that each adds to the lower ones.
+
+        Returns [*colour, V, L+1], or [*colour, V, A, L+1] of anisotropic materials. Of slices fitted above the horizon,
+        norms are those above it, of the best fit of each degree there.
+        Derivatives: in the coefficients.
+        """
+        return _energies.band_energies(self.coefficients, self.domain)
+
+    def needed_degree(self, tolerance: float, *, worst: bool = False) -> int:
+        """The smallest degree whose slices differ from these by at most `tolerance`, relative to their RMS.
+
+        Arguments: static `tolerance`; the RMS is over the views of a sphere's picture, by colour, of which the worst
+        counts; `worst=True` takes the worst view instead. The light is not asked: `planning` does that, and needs less
+        where the light is smooth.
+        The choice is made from values, not under jit. Slices end at their own degree, and what is beyond cannot be
+        seen: where their last two bands are needed for the tolerance (odd ones vanish for a Lambertian), that is an
+        error.
+        """
+        tolerance = _checks.number("tolerance", tolerance, positive=True)
+        try:
+            energies = np.asarray(self.energies(), float)
+        except jax.errors.TracerArrayConversionError as error:
+            raise ValueError("the degree is chosen from values: call needed_degree outside jit and grad.") from error
+        if not np.all(np.isfinite(energies)):
+            raise ValueError("the slices hold NaN or infinity: their degree cannot be chosen.")
+        found = _energies.needed_degree(energies.reshape(-1, *energies.shape[len(self.colour) :]), tolerance, worst)
+        if found > max(self.degree - 2, 0):
+            raise ValueError(
+                f"slices of degree {self.degree} need their last bands for `tolerance` {tolerance}, and may need more: "
+                "make them of a higher degree."
+            )
+        return found
 
     @method
     def weights(self, basis: RotatedZonalBasis) -> Float[Array, "*colour_views l k"]:
@@ -103,7 +140,7 @@ class Slices(Module):
         basis: RotatedZonalBasis,
         weights: ArrayLike,
         *,
-        quadrature_error: ArrayLike = 0.0,
+        error: ArrayLike = 0.0,
         isotropic: bool = True,
         domain: Literal["sphere", "upper"] = "sphere",
     ) -> "Slices":
@@ -114,7 +151,7 @@ class Slices(Module):
         if not isinstance(basis, RotatedZonalBasis):
             raise ValueError(f"`basis` must be a decomposition.RotatedZonalBasis; got {type(basis).__name__}.")
         c = basis.coefficients(weights)
-        return cls(c, quadrature_error=quadrature_error, isotropic=isotropic, domain=domain)
+        return cls(c, error=error, isotropic=isotropic, domain=domain)
 
 
 def check_domain(domain: object) -> None:
@@ -154,7 +191,7 @@ def slice_values(table: Float[Array, "*colour n columns"], view: Float[Array, "p
     cos, sin = _views.azimuth_factors(view, degree + 1)
     sin = sin[np.abs(m)] * jnp.asarray(-np.sign(m)[:, None], c.dtype)
     cos, sin = (jnp.broadcast_to(f, c.shape) for f in (cos[np.abs(m)], sin))
-    return cos * c + sin * c[..., l * l + l - m, :]
+    return cos * c + sin * c[..., place(l, -m), :]
 
 
 def slice_orders(slices: Slices, degree: int) -> Callable[[Float[Array, "p 3"]], tuple[Array, Array]]:

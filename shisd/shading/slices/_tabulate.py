@@ -16,12 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import DTypeLike
 
 from shisd import _checks
 from shisd._numerics import safe_sqrt
 from shisd._progress import Progress, reporting
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
 from shisd.harmonics.internal import orders, weighted_sums
 from shisd.models import AbstractBrdf
@@ -52,23 +51,23 @@ def tabulate_brdf(
     `azimuths`, even, for anisotropic materials only, by default 2 degree + 4 and at least 32: a slice turns with the
     view, so its order m goes round m times, and fewer azimuths alias without notice; `quadrature`, nodes from the
     mirror direction to the horizon (and half as many in each eighth of a turn about it).
-    `quadrature` None takes 32 + degree nodes, and 3/2 and 9/4 as many where that is not enough: where
-    `Slices.quadrature_error` is above `tolerance`. If no rule, or the one given, is enough, it is a ValueError;
-    `throw=False` leaves that to the caller. While JAX traces, as under jit and grad, nothing can be chosen: 32 + degree
-    nodes are taken unless `quadrature` says otherwise, and it is an error at run time where they are not enough. The
-    error is estimated from what the last quarter of the nodes changes in the slices, a, and the quarter before, b: as
-    2 a min(1, a / b), of the worst colour, a and b RMS over the views of a sphere's picture relative to the slices.
+    `quadrature` None takes 32 + degree nodes, and 3/2 and 9/4 as many where that is not enough: where `Slices.error` is
+    above `tolerance`. If no rule, or the one given, is enough, it is a ValueError; `throw=False` leaves that to the
+    caller. While JAX traces, as under jit and grad, nothing can be chosen: 32 + degree nodes are taken unless
+    `quadrature` says otherwise, and it is an error at run time where they are not enough. The error is estimated from
+    what the last quarter of the nodes changes in the slices, a, and the quarter before, b: as 2 a min(1, a / b), of the
+    worst colour, a and b RMS over the views of a sphere's picture relative to the slices.
     `domain` "upper" fits the slices above the horizon only, for integrals over lights that are cut off there
-    (`shade_polygon`): the kink of the cosine is no longer expanded, and errors are up to 100 times smaller. `ridge`
+    (`PolygonLight`): the kink of the cosine is no longer expanded, and errors are up to 100 times smaller. `ridge`
     limits what the fit may do below the horizon: rounding grows like 1/sqrt(ridge), measured 1e-5 in float32 at the
     default. `progress`: None, True for a bar of tqdm, or a function of (done, total) elevations, told for every rule
     that is tried; not while JAX traces. The result has the dtype of the material's parameters.
     Derivatives: in every parameter of the material, both modes. The nodes follow `brdf.lobe_width`, through which no
     derivative passes.
-    Accuracy: `quadrature_error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's
-    format at degree 16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in
-    float32, 2e-7 for GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1;
-    4e-4 or less for tables in MERL's format at degree 16.
+    Accuracy: `error` was 0.7 to 3 times the true error (GGX of alpha 0.1 at degree 3, tables in MERL's format at degree
+    16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in float32, 2e-7 for
+    GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1; 4e-4 or less for
+    tables in MERL's format at degree 16.
     Cost: 1.8 elevations x quadrature^2 evaluations of the material; one view's harmonics are in memory at a time.
     """
     degree = degree.degree if isinstance(degree, RotatedZonalBasis) else _checks.degree(degree)
@@ -84,7 +83,7 @@ def table(
     degree: int,
     norms: Norms,
     elevations: int,
-    azimuths: int,
+    azimuths: int | None,
     quadrature: int | None,
     tolerance: float,
     throw: bool,
@@ -101,7 +100,7 @@ def table(
     theta, dtype = _views.elevations(elevations), jnp.result_type(brdf.lobe_width)
     made = lambda nodes: slices_at(theta, brdf, degree, dtype, azimuths, nodes, norms, progress)
     c, error = by_convergence(made, 32 + degree, quadrature, tolerance, throw)
-    return Slices(c, quadrature_error=error, isotropic=brdf.isotropic)
+    return Slices(c, error=error, isotropic=brdf.isotropic)
 
 
 def by_convergence(
@@ -129,7 +128,7 @@ def by_convergence(
         raise ValueError(
             f"The quadrature does not resolve this material: by `quadrature` {nodes} its estimated error is "
             f"{found:.2g}, above `tolerance` {tolerance:.2g}. Pass `quadrature={3 * nodes // 2}`, a larger "
-            "tolerance, or throw=False and read `quadrature_error`."
+            "tolerance, or throw=False and read `error`."
         )
     return values, error
 
@@ -141,7 +140,7 @@ def _resolved(values: Pytree, error: Scalar, nodes: int, tolerance: float) -> Py
         ~(error <= tolerance),
         f"The quadrature does not resolve this material: by `quadrature` {nodes} its estimated error is above "
         f"`tolerance` {tolerance:.2g}, or the material is not finite. Under jit and grad no other rule can be tried: "
-        f"pass `quadrature={3 * nodes // 2}`, a larger tolerance, or throw=False and read `quadrature_error`.",
+        f"pass `quadrature={3 * nodes // 2}`, a larger tolerance, or throw=False and read `error`.",
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from shisd import _checks
 from shisd._typing import Array, Float
-from shisd.harmonics.internal import associated_legendre
+from shisd.harmonics.internal import associated_legendre, of_order
 
 RIDGE = 1e-6  # of fits above the horizon
 
@@ -29,10 +29,10 @@ def hemisphere_modes(degree: int) -> tuple[np.ndarray, np.ndarray]:
     modes, shares = np.zeros(((degree + 1) ** 2,) * 2), np.zeros((degree + 1) ** 2)
     blocks = hemisphere_blocks(degree)
     for m in range(-degree, degree + 1):
-        l = np.arange(abs(m), degree + 1)
+        own = of_order(degree, m)
         values, vectors = np.linalg.eigh(blocks[abs(m)])
-        modes[np.ix_(l * l + l + m, l * l + l + m)] = vectors
-        shares[l * l + l + m] = np.maximum(values, 0)
+        modes[np.ix_(own, own)] = vectors
+        shares[own] = np.maximum(values, 0)
     return modes, shares
 
 
