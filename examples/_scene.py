@@ -272,8 +272,8 @@ def sheet(
                 if note := (notes or {}).get((i, k)):
                     axes.text(0.97, 0.04, note, ha="right", transform=axes.transAxes, path_effects=halo)
         if limits:
-            colour_scale(figure, (*at(size[0] - 236, size[1] - 22), 220 / size[0], 10 / size[1]), limits)
-            figure.text(*at(size[0] - 262, size[1] - 27), "error / mean radiance", ha="right", va="center", fontsize=8)
+            colour_scale(figure, (*at(size[0] - 248, size[1] - 22), 220 / size[0], 10 / size[1]), limits)
+            figure.text(*at(size[0] - 274, size[1] - 27), "error / mean radiance", ha="right", va="center", fontsize=8)
         save(path, lambda file: figure.savefig(file, format="png", dpi=dpi, facecolor=PAPER))
         pyplot.close(figure)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from shisd import filtering, io, models
 
-EXPOSURE = 1.2
+EXPOSURE = 1.0
 LIMITS = 1e-3, 1.0  # relative errors at the ends of the false-colour scale
 LIGHTS = (((0.2, -1.0, 0.6), 3.0), ((1.0, -0.4, 0.1), 2.0), ((-0.6, -0.5, -0.3), 1.0))  # towards them, and their power
 

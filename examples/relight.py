@@ -184,9 +184,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(table(rows))
     check(rows)
     worst = max(max(r["sphere error"], r["rabbit error"]) for r in rows if r["degree"] == max(options.degrees))
-    reached = (
-        f"Radiance within {100 * worst:.2g} % of Monte Carlo at degree {max(options.degrees)}, for the worst picture"
-    )
+    reached = f"Radiance within {100 * worst:.2g} % of Monte Carlo at degree {max(options.degrees)} (worst picture)"
     _scene.verdict(f"{reached}. Errors fall with degree for every material and map", start, options.output)
 
 

@@ -19,6 +19,37 @@ def python(*arguments, cwd=ROOT):
     )
 
 
+def verdict(done, output):
+    """The last line: the name of what was reached, its number, the seconds, and where to look."""
+    assert done.returncode == 0, done.stdout + done.stderr
+    last = done.stdout.splitlines()[-1]
+    assert re.fullmatch(rf"[A-Z][a-z]+ .*(within|agree) .*\d.*, in [\d.]+ s; see {re.escape(str(output))}/\.", last), (
+        last
+    )
+    return last
+
+
+def test_a_mesh_of_any_unit_fills_the_picture(tmp_path, monkeypatch):
+    """In its own unit, and in one a thousand times smaller, far from the origin."""
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("embreex")
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import _scene
+
+    shape = trimesh.load_mesh(_scene.DATA / "bunny.ply")
+    shape.apply_scale(1e3)
+    shape.apply_translation([5e3, -2e3, 7e3])
+    shape.export(tmp_path / "large.ply")
+    views = [_scene.mesh(path, 48, _scene.AZIMUTH) for path in (_scene.DATA / "bunny.ply", tmp_path / "large.ply")]
+    differ = sum(views[0].seen.ravel() != views[1].seen.ravel())
+    assert differ < 0.01 * views[0].seen.sum()
+    for view in views:
+        assert max(x.max() for x in abs(view.positions)) < 1
+        extents = [index.max() - index.min() for index in view.seen.nonzero()]
+        assert max(extents) > 0.7 * 48
+        assert not (view.seen[0].any() or view.seen[-1].any() or view.seen[:, 0].any() or view.seen[:, -1].any())
+
+
 @pytest.mark.slow
 def test_relight_writes_pictures_and_a_table(tmp_path):
     output = tmp_path / "relight"
@@ -27,6 +58,7 @@ def test_relight_writes_pictures_and_a_table(tmp_path):
     done = python(*command, *small)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Errors fall with degree" in done.stdout
+    assert verdict(done, output).startswith("Radiance within")
     with (output / "relight.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * 2 * 2
@@ -54,7 +86,7 @@ def test_area_lights_writes_pictures_and_a_table(tmp_path):
     output = tmp_path / "area_lights"
     command = [ROOT / "examples/area_lights.py", "--output", output, "--size", 24, "--nodes", 12]
     done = python(*command)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert verdict(done, output).startswith("Radiance within")
     assert (output / "area_lights.md").read_text() in done.stdout
     assert {path.stem for path in output.glob("*.png")} == {
         "area_lights",
@@ -81,7 +113,7 @@ def test_applications_write_a_picture_and_a_table(name, options, tmp_path):
     output = tmp_path / name
     command = [ROOT / f"examples/{name}.py", "--output", output]
     done = python(*command, *options)
-    assert done.returncode == 0, done.stdout + done.stderr
+    verdict(done, output)
     assert (output / f"{name}.md").read_text() in done.stdout
     assert [path.name for path in output.glob("*.png")] == [f"{name}.png"]
     refused = python(*command)
@@ -94,7 +126,7 @@ def test_many_devices_agree_with_one(tmp_path):
     output = tmp_path / "many_devices"
     command = [ROOT / "examples/many_devices.py", "--output", output]
     done = python(*command, "--degree", 4, "--pixels", 512, "--devices", 2)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert verdict(done, output).startswith("Radiance and gradients")
     assert (output / "many_devices.md").read_text() in done.stdout and "agree with one device" in done.stdout
     assert "2 processes" in done.stdout and "2 simulated devices" in done.stdout
     refused = python(*command)
@@ -113,7 +145,7 @@ def test_fit_material_finds_the_material(tmp_path):
     output = tmp_path / "fit_material"
     command = [ROOT / "examples/fit_material.py", "--output", output]
     done = python(*command, "--size", 48, "--degree", 16, "--noisy", 1)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert verdict(done, output).startswith("Material within")
     assert (output / "fit_material.md").read_text() in done.stdout and (output / "fit_material.png").exists()
     rows = fitted(output)
     assert {"roughness", "anisotropy", "albedo, blue", "specular"} < set(rows)
@@ -129,7 +161,7 @@ def test_fit_material_finds_the_material(tmp_path):
 def test_fit_light_finds_the_lamp(tmp_path):
     output = tmp_path / "fit_light"
     done = python(ROOT / "examples/fit_light.py", "--output", output, "--size", 24, "--noisy", 0)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert verdict(done, output).startswith("Lamp within")
     assert (output / "fit_light.md").read_text() in done.stdout and (output / "fit_light.png").exists()
     rows = fitted(output)
     move = [float(rows[axis]["found"]) - float(rows[axis]["truth"]) for axis in "xyz"]
