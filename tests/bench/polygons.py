@@ -16,7 +16,7 @@ from numpy.polynomial import legendre
 from scipy.optimize import least_squares
 
 from shisd.harmonics import _sh, _tables
-from shisd.reference import Estimate
+from shisd.reference._monte_carlo import Estimate
 
 # ---- integrals of zonal harmonics, NumPy
 

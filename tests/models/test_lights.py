@@ -243,7 +243,9 @@ MATERIALS = {  # two structures of slices, so that code of `shade` is shared
 
 
 def test_every_material_is_here():
-    assert {type(make()) for make in MATERIALS.values()} == set(models.AbstractBrdf.__subclasses__())
+    assert {type(make()) for make in MATERIALS.values()} == {
+        kind for kind in models.AbstractBrdf.__subclasses__() if kind.__module__.startswith("shisd")
+    }
 
 
 def _prepared(brdf):
