@@ -196,7 +196,7 @@ def sheet(
             axes.set_title(title)
             axes.imshow(image, interpolation="nearest")
         _scene.colour_scale(figure, (0.441, 0.075, 0.16, 0.025), limits)
-        axes = figure.add_axes((0.672, 0.17, 0.233, 0.72))
+        axes = figure.add_axes((0.672, 0.17, 0.222, 0.72))
         for (name, values), colour in zip(curves.items(), COLOURS, strict=False):
             axes.semilogy(np.arange(len(values)), values, label=name, color=colour, linewidth=1.3)
         axes.set_title("error % by step")

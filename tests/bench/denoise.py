@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import filtering, models
+from shisd.filtering._brdf import BrdfFit
 from shisd.filtering._merl import _bin_energy
 from shisd.io._merl import tabulate_merl
 from shisd.io.internal import merl_above_horizon, merl_directions
@@ -54,7 +55,7 @@ def rms(error: np.ndarray) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def fit_bins(noisy: np.ndarray, degree: int) -> filtering.BrdfFit:
+def fit_bins(noisy: np.ndarray, degree: int) -> BrdfFit:
     """ISD15's projection of bins drawn with the share of the energy that they stand for."""
     energy = np.where(np.all(noisy >= 0, axis=-1), _bin_energy(), 0).ravel()
     wi, wo = (w.reshape(-1, 3) for w in merl_directions())
