@@ -6,9 +6,11 @@ Shapes, types and static arguments are known while tracing, so these checks cost
 import math
 import numbers
 import operator
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -129,6 +131,16 @@ def require(value: T, good: Any, message: str) -> T:
     if not np.all(good):
         raise ValueError(message)
     return value
+
+
+def held(tree: T, check: Callable[[Array], Array]) -> T:
+    """`tree`, whose floating arrays and their derivatives need `check(1)`, which gives it back or is a run-time error.
+
+    The 1 is a factor of all. An error of the value alone is dropped with it, where only the gradient is used: that of
+    what is linear in the value does not need it.
+    """
+    one = check(jnp.ones(()))
+    return jax.tree.map(lambda x: x * one.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
 def degree(value: object) -> int:

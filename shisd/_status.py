@@ -5,6 +5,8 @@ from typing import TypeVar
 import equinox as eqx
 from jax.core import Tracer
 
+from shisd import _checks
+
 Result = TypeVar("Result")
 
 
@@ -50,7 +52,7 @@ def settled(result: Result, status: Status, throw: bool) -> Result:
         return result
     bad = status != Status.ok
     if isinstance(bad, Tracer):
-        return status.error_if(result, bad)
+        return _checks.held(result, lambda one: status.error_if(one, bad))
     if bad:
         raise ValueError(Status[status])
     return result

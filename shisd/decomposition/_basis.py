@@ -124,8 +124,8 @@ class RotatedZonalBasis(Module):
 
 @eqx.filter_jit
 def _weights(batch: dict[str, Array], basis: RotatedZonalBasis) -> Float[Array, "*batch l k"]:
-    weights, _ = weights_by_band(basis._matrices(), batch["coefficients"], basis.degree, throw=True)
-    return used_only(weights, basis.nested)
+    weights, bad = weights_by_band(basis._matrices(), batch["coefficients"], basis.degree)
+    return used_only(refused(weights, bad, unresolved(basis.degree)), basis.nested)
 
 
 @eqx.filter_jit
@@ -136,11 +136,10 @@ def _condition_numbers(basis: RotatedZonalBasis) -> Float[Array, " l"]:
 
 
 def weights_by_band(
-    m: Float[Array, "bands n K"], c: Float[Array, "*batch coefs"], degree: int, ridge: float = 0.0, *, throw: bool
+    m: Float[Array, "bands n K"], c: Float[Array, "*batch coefs"], degree: int, ridge: float = 0.0
 ) -> tuple[Float[Array, "*batch bands K"], Bool[Array, " bands"]]:
     """Weights of least norm for matrices M_l, stacked and padded as `padding` says, and which bands are bad."""
-    messages = [_unresolved(l) for l in range(degree + 1)] if throw else None
-    weights, bad = minimum_norm(m, by_band(c, degree), padding(degree)[1], ridge, messages)
+    weights, bad = minimum_norm(m, by_band(c, degree), padding(degree)[1], ridge)
     return jnp.moveaxis(weights, -1, 0).reshape(*c.shape[:-1], *weights.shape[:-1]), bad
 
 
@@ -155,13 +154,11 @@ def minimum_norm(
     c: Float[Array, "bands n batch"],
     mask: np.ndarray,
     ridge: float = 0.0,
-    unresolved: list[str] | None = None,
 ) -> tuple[Float[Array, "bands K batch"], Bool[Array, " bands"]]:
     """x of least norm with m x = c in every band, for right-hand sides that are zero outside `mask` [bands, n].
 
     With `ridge`, x minimises |m x - c|^2 + ridge s |x|^2, s = the mean eigenvalue of m m^T. Bad are the bands whose
-    condition number exceeds eps^(-1/2), eps the rounding of m: where there are messages `unresolved`, the band's own is
-    an error at run time, of gradients too. The result has the dtype that m and c promote to.
+    condition number exceeds eps^(-1/2), eps the rounding of m. The result has the dtype that m and c promote to.
 
     notation: q r = (m^T, sqrt(ridge s) 1), q_1 = the rows of q beside m^T, x = q_1 r^-T c. Padding columns of m^T have
     a one in a row of their own, which keeps full rank, as derivatives of QR need, and leaves the columns in use alone.
@@ -185,19 +182,25 @@ def minimum_norm(
     norm = lambda a: jnp.sqrt(jnp.sum(jnp.where(mask[:, None, :] & mask[:, :, None], a * a, 0), axis=(1, 2)))
     condition = norm(r) * norm(r_inverse) / jnp.asarray(mask.sum(axis=1), dtype=r.dtype)
     bad = ~(jax.lax.stop_gradient(condition) <= eps**-0.5)
-    if unresolved is not None:  # of c, on which gradients depend; they do not on a value that is linear in it
-        c = eqx.branched_error_if(c, jnp.any(bad), jnp.argmax(bad), unresolved)
     solution = jax.lax.map(lambda a: solve_triangular(*a, trans="T"), (r, c))
     return jnp.matmul(q[:, : m.shape[-1]], solution, precision="highest"), bad
 
 
-def _unresolved(l: int) -> str:
-    return (
+def refused(weights: Array, bad: Bool[Array, " bands"], messages: list[str]) -> Array:
+    """`weights`, or the error of the first band that is bad."""
+    check = lambda one: eqx.branched_error_if(one, jnp.any(bad), jnp.argmax(bad), messages)
+    return _checks.held(weights, check)
+
+
+def unresolved(degree: int) -> list[str]:
+    """The messages of all bands."""
+    return [
         f"The `directions` of the basis do not resolve degree {l}: its matrix is singular to working precision. Two "
         "axes may be equal or opposite (z and -z are one axis), or all may lie in a plane or on a cone. Use "
         "decomposition.optimized_directions(degree), add directions, or improve these with "
         "decomposition.optimize_directions."
-    )
+        for l in range(degree + 1)
+    ]
 
 
 def unit_axes(directions: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:

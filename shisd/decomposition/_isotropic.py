@@ -19,7 +19,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from shisd import _checks
 from shisd._methods import method
@@ -124,9 +123,7 @@ class IsotropicBasis(Module):
         `weights` refuses, which is an error but with `throw=False`.
         """
         c = _basis.check_coefficients(coefficients, self.degree)
-        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((self, c)))  # then gradients have to fail too
-        ridge = _checks.number("ridge", ridge)
-        weights, error, bad = by_device(_with_error, {"coefficients": c}, self, ridge, throw and traced)
+        weights, error, bad = by_device(_with_error, {"coefficients": c}, self, _checks.number("ridge", ridge))
         status = Status.where(jnp.any(bad), Status.ill_conditioned, Status.ok)
         return settled(Decomposition(weights, error, _condition_number(self), status), status, throw)
 
@@ -191,15 +188,14 @@ class IsotropicBasis(Module):
         return jnp.where(mask[:, :, None], m[index, levels], 0)
 
     def _solve(
-        self, m: Float[Array, "n l k"], c: Float[Array, "*batch n"], ridge: float, throw: bool
+        self, m: Float[Array, "n l k"], c: Float[Array, "*batch n"], ridge: float
     ) -> tuple[Float[Array, "*batch l k"], Bool[Array, " bad"]]:
         if self.kernel.diagonal:
-            weights, bad = _basis.weights_by_band(self._blocks(m), c, self.degree, ridge, throw=throw)
+            weights, bad = _basis.weights_by_band(self._blocks(m), c, self.degree, ridge)
             return _basis.used_only(weights, self.nested), bad
         n = m.shape[0]
         columns = c.reshape(-1, n).T
-        unresolved = [_SINGULAR] if throw else None
-        weights, bad = _basis.minimum_norm(m.reshape(1, n, -1), columns[None], np.ones((1, n), bool), ridge, unresolved)
+        weights, bad = _basis.minimum_norm(m.reshape(1, n, -1), columns[None], np.ones((1, n), bool), ridge)
         return _basis.used_only(weights[0].T.reshape(*c.shape[:-1], *m.shape[1:]), self.nested), bad
 
     def _condition(self, m: Float[Array, "n l k"]) -> Scalar:
@@ -268,15 +264,14 @@ def _matrix(basis: IsotropicBasis) -> Float[Array, "n l k"]:
 
 @eqx.filter_jit
 def _weights(batch: dict[str, Array], basis: IsotropicBasis, ridge: float) -> Float[Array, "*batch l k"]:
-    return basis._solve(_matrix(basis), batch["coefficients"], ridge, True)[0]
+    weights, bad = basis._solve(_matrix(basis), batch["coefficients"], ridge)
+    return _basis.refused(weights, bad, _basis.unresolved(basis.degree) if basis.kernel.diagonal else [_SINGULAR])
 
 
 @eqx.filter_jit
-def _with_error(
-    batch: dict[str, Array], basis: IsotropicBasis, ridge: float, throw: bool
-) -> tuple[Array, Array, Array]:
+def _with_error(batch: dict[str, Array], basis: IsotropicBasis, ridge: float) -> tuple[Array, Array, Array]:
     m, c = _matrix(basis), batch["coefficients"]
-    weights, bad = basis._solve(m, c, ridge, throw)
+    weights, bad = basis._solve(m, c, ridge)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(c), axis=-1, keepdims=True))
     scale = jnp.where(largest > 0, largest, 1)  # squares of large and of small numbers leave the range
     norm = lambda a: safe_sqrt(jnp.sum((a / scale) ** 2, axis=-1))

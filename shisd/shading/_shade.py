@@ -1,10 +1,8 @@
 """The one verb: radiance from any material under any lights, by the path of each kind of light."""
 
-import functools
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
@@ -13,7 +11,7 @@ from shisd.models import DistantLight, Environment, Occluded, PolygonLight, Port
 from shisd.shading._material import Material, as_material
 from shisd.shading._matrix import BrdfMatrix
 from shisd.shading._surface import Surface, check_surface
-from shisd.shading._tiles import Form, as_type, floating_type
+from shisd.shading._tiles import Form, as_type, floating_type, sum_parts
 from shisd.shading.paths import _distant, _occluded, _polygon, _sphere, _zonal
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices
@@ -78,7 +76,7 @@ def shade(
     points = [_points(surface, path, form) for path, form in zip(groups, forms, strict=True)]
     colours = {"material": forms[0].colour} | {f"light {i}": x.colour for i, x in enumerate(known)}
     try:
-        most = len(np.broadcast_shapes(*colours.values(), *(form.colour for form in forms)))
+        np.broadcast_shapes(*colours.values(), *(form.colour for form in forms))
     except ValueError as error:
         named = " and ".join(f"`{name}` {list(c)}" for name, c in colours.items())
         raise ValueError(f"colours of {named} do not broadcast.") from error
@@ -86,11 +84,8 @@ def shade(
     parts = []
     for (path, group), form, own in zip(groups.items(), as_type(forms, dtype), as_type(points, dtype), strict=True):
         colour = np.broadcast_shapes(form.colour, *(light.colour for light in group))
-        value = path.radiance(form, as_type(group, dtype), own, surface)
-        batch = value.shape[: value.ndim - len(colour)]
-        parts.append(value.reshape(*batch, *(1,) * (most - len(colour)), *colour))
-    shape = np.broadcast_shapes(*(part.shape for part in parts))
-    return functools.reduce(jnp.add, (jnp.broadcast_to(part, shape) for part in parts))
+        parts.append((path.radiance(form, as_type(group, dtype), own, surface), colour))
+    return sum_parts(parts)
 
 
 def _known(lights: Light | Sequence[Light]) -> list[Light]:

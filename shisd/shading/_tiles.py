@@ -55,6 +55,23 @@ def stacked(lights: Iterable[Light]) -> list[Light]:
     return [jax.tree.map(lambda *x: jnp.stack(x), *group) for group in kinds.values()]
 
 
+def sum_parts(parts: Iterable[tuple[Array, Shape]]) -> Array:
+    """Sum of radiances [*batch, *colour], each with its own colour axes; batch axes and colours broadcast."""
+    parts = list(parts)
+    most = max(len(colour) for _, colour in parts)
+    fit = lambda x, c: x.reshape(*x.shape[: x.ndim - len(c)], *(1,) * (most - len(c)), *c)
+    values = [fit(x, colour) for x, colour in parts]
+    shape = np.broadcast_shapes(*(x.shape for x in values))
+    return functools.reduce(jnp.add, (jnp.broadcast_to(x, shape) for x in values))
+
+
+def padded(c: Float[Array, "*own n"], size: int, colour: Shape) -> Float[Array, "*colour size"]:
+    """The first `size` coefficients, zero beyond those there are, of all colours."""
+    c = c[..., :size]
+    c = jnp.pad(c, [(0, 0)] * (c.ndim - 1) + [(0, size - c.shape[-1])])
+    return jnp.broadcast_to(c, (*colour, size))
+
+
 def sum_lights(radiance: Callable[[Any], Array], stacks: Iterable[Any], total: Array) -> Array:
     """`total` and radiance(light) of every light of stacks: the code of one light for each stack, in a loop.
 

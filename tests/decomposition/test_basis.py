@@ -354,6 +354,12 @@ def test_refusals_work_under_transformations(transform, x64, as_user):
         jax.block_until_ready(jax.jit(call)(z, jnp.ones((3, 9) if transform == "vmap" else 9)))
 
 
+def test_refusals_are_there_where_only_the_gradient_is_used(x64, as_user):
+    z = jnp.asarray(SINGULAR["two equal axes"](2))
+    with pytest.raises(RuntimeError, match="do not resolve degree 2"):  # linear: its gradient needs no value
+        jax.block_until_ready(jax.jit(jax.grad(lambda c: jnp.sum(RotatedZonalBasis(z, 2).weights(c))))(jnp.ones(9)))
+
+
 @pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
 @pytest.mark.parametrize("method", ["weights", "coefficients", "evaluate", "condition_numbers"])
 def test_zero_and_non_finite_axes_are_refused_by_every_method(bad, method, as_user):

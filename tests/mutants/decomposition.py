@@ -25,6 +25,13 @@ MUTANTS = [
         test="tests/decomposition/test_basis.py::test_methods_compile_once_and_jit_takes_them",
     ),
     Mutant(
+        "errors of values that gradients do not need",
+        "shisd/_checks.py",
+        old="x * one.astype(x.dtype) if",
+        new="x + (one.astype(x.dtype) - 1) if",
+        test="tests/decomposition/test_basis.py::test_refusals_are_there_where_only_the_gradient_is_used",
+    ),
+    Mutant(
         "objective of directions without its gradient",
         "shisd/decomposition/_directions.py",
         old="jnp.linalg.eigvalsh(gram)",

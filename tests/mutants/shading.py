@@ -153,23 +153,22 @@ MUTANTS = [
     ),
     Mutant(
         "only the first kind of light", "shisd/shading/_shade.py",
-        old="functools.reduce(jnp.add, (jnp.broadcast_to(part, shape) for part in parts))",
-        new="jnp.broadcast_to(parts[0], shape)", test=MIXED,
+        old="return sum_parts(parts)", new="return sum_parts(parts[:1])", test=MIXED,
     ),
     Mutant(
         "only the first distant light", "shisd/shading/paths/_distant.py",
-        old="return functools.reduce(jnp.add, parts)", new="return parts[0]", test=MIXED,
+        old="size, colour) for light in lights))", new="size, colour) for light in lights[:1]))", test=MIXED,
     ),
     Mutant(
         "only the first light that is hidden in part", "shisd/shading/paths/_occluded.py",
-        old="return functools.reduce(jnp.add, parts)", new="return parts[0]", test=MIXED,
+        old="colour(light)) for light in lights)", new="colour(light)) for light in lights[:1])", test=MIXED,
     ),
     Mutant(
         "distant lights up to the lowest of their degrees", "shisd/shading/paths/_distant.py",
         old="min(degree, max(light.degree", new="min(degree, min(light.degree", test=MIXED,
     ),
     Mutant(
-        "distant lights of few bands put among high ones", "shisd/shading/paths/_distant.py",
+        "distant lights of few bands put among high ones", "shisd/shading/_tiles.py",
         old="(0, size - c.shape[-1])]", new="(size - c.shape[-1], 0)]", test=MIXED,
     ),
     Mutant(

@@ -22,7 +22,7 @@ from shisd.models import DistantLight
 from shisd.shading._material import distant_form
 from shisd.shading._matrix import BrdfMatrix, matrix_orders
 from shisd.shading._surface import Surface
-from shisd.shading._tiles import shade_points, shade_tiles
+from shisd.shading._tiles import padded, shade_points, shade_tiles
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices, slice_orders
 
@@ -44,13 +44,7 @@ def sum_distant(lights: list[DistantLight], degree: int) -> Float[Array, "*colou
     """All lights together, up to the highest of their degrees and at most `degree`."""
     size = (min(degree, max(light.degree for light in lights)) + 1) ** 2
     colour = np.broadcast_shapes(*(light.colour for light in lights))
-    parts = []
-    for light in lights:
-        c = light.coefficients[..., :size]
-        if c.shape[-1] < size:
-            c = jnp.pad(c, [(0, 0)] * (c.ndim - 1) + [(0, size - c.shape[-1])])
-        parts.append(jnp.broadcast_to(c, (*colour, size)))
-    return functools.reduce(jnp.add, parts)
+    return functools.reduce(jnp.add, (padded(light.coefficients, size, colour) for light in lights))
 
 
 @eqx.filter_jit

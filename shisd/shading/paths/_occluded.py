@@ -12,8 +12,6 @@ slice, which has the fewest colours. One v for all pixels is a light of its own.
 notation: u = coefficients of the visible light; R = (t, b, n) local to world.
 """
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +26,7 @@ from shisd.models import DistantLight, Occluded, Visibility, ZonalLight
 from shisd.models.internal import surface_corners
 from shisd.shading._material import slices_everywhere
 from shisd.shading._surface import Surface, broadcast_batch
-from shisd.shading._tiles import shade_points, shade_tiles
+from shisd.shading._tiles import shade_points, shade_tiles, sum_parts
 from shisd.shading.paths import _distant
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices, slice_orders
@@ -39,14 +37,8 @@ _NUMBERS_AT_ONCE = 3 << 18  # of visible light in a tile
 def radiance(
     slices: Slices, lights: list[Occluded], points: dict[str, Array], surface: Surface
 ) -> Float[Array, "*batch_colour"]:
-    most = max(len(light.colour) for light in lights)
-    parts = [_one(slices, light, points, surface) for light in lights]
-    if not slices.colour:
-        parts = [
-            x.reshape(*x.shape[: x.ndim - len(light.colour)], *(1,) * (most - len(light.colour)), *light.colour)
-            for x, light in zip(parts, lights, strict=True)
-        ]
-    return functools.reduce(jnp.add, parts)
+    colour = lambda light: np.broadcast_shapes(slices.colour, light.colour)
+    return sum_parts((_one(slices, light, points, surface), colour(light)) for light in lights)
 
 
 PATH = Path(slices_everywhere, radiance, local=False)

@@ -3,10 +3,13 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from shisd._sharding import by_device
 from shisd._typing import Array
 from shisd.shading._material import Material
 from shisd.shading._surface import Surface
-from shisd.shading._tiles import Form
+from shisd.shading._tiles import Form, shade_points
 
 
 class Path(NamedTuple):
@@ -20,3 +23,13 @@ class Path(NamedTuple):
     form: Callable[[Material, str], Form]
     radiance: Callable[[Any, list, dict[str, Array], Surface], Array]
     local: bool
+
+
+def local_path(form: Callable[[Material, str], Form], shade: Callable[..., Array]) -> Path:
+    """That of lights at finite distance, by `shade(points, slices, lights, colour)`, as `shade_points` takes it."""
+
+    def radiance(slices: Any, lights: list, points: dict[str, Array], _: Surface) -> Array:
+        colour = np.broadcast_shapes(slices.colour, *(light.colour for light in lights))
+        return by_device(shade_points, points, shade, slices, lights, colour)
+
+    return Path(form, radiance, local=True)

@@ -19,7 +19,6 @@ import numpy as np
 
 from shisd import _checks
 from shisd._numerics import dot, times
-from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.domains.internal import (
     Loop,
@@ -35,25 +34,14 @@ from shisd.models import PolygonLight, PortalLight
 from shisd.models.internal import facing
 from shisd.shading._incidence import incidence_integrals
 from shisd.shading._material import local_form
-from shisd.shading._surface import Surface
-from shisd.shading._tiles import shade_points, shade_tiles, stacked, sum_lights
-from shisd.shading.paths._path import Path
+from shisd.shading._tiles import shade_tiles, stacked, sum_lights
+from shisd.shading.paths._path import local_path
 from shisd.shading.slices._slices import Slices, lookup_factors, lookup_table, slice_values
 
 Light = PolygonLight | PortalLight
 _TILE = 2048  # pixels at a time
 SMALL_TILE = 128  # where every pixel holds the moments about all axes
 Y_00 = math.sqrt(1 / (4 * math.pi))
-
-
-def radiance(
-    slices: Slices, lights: list[Light], points: dict[str, Array], _: Surface
-) -> Float[Array, "*batch_colour"]:
-    colour = np.broadcast_shapes(slices.colour, *(light.colour for light in lights))
-    return by_device(shade_points, points, _shade, slices, lights, colour)
-
-
-PATH = Path(local_form, radiance, local=True)
 
 
 @eqx.filter_jit
@@ -85,6 +73,9 @@ def _shade(
 
     size = _TILE if all(product is None for _, product in stacks) else SMALL_TILE
     return shade_tiles(slices, points, colour, size, of_tile, kinds)
+
+
+PATH = local_path(local_form, _shade)
 
 
 def _uniform(slices: Slices, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:

@@ -9,29 +9,16 @@ notation: a = direction to the center, in the local frame; z_l = integral of P_l
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 
 from shisd._numerics import times
-from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.domains.internal import cap_coefficients
 from shisd.models import SphereLight
 from shisd.models.internal import versine
 from shisd.shading._material import slices_everywhere
-from shisd.shading._surface import Surface
-from shisd.shading._tiles import shade_points, shade_tiles, stacked, sum_lights
-from shisd.shading.paths._path import Path
+from shisd.shading._tiles import shade_tiles, stacked, sum_lights
+from shisd.shading.paths._path import local_path
 from shisd.shading.slices._slices import Slices, lookup_table, slice_values
-
-
-def radiance(
-    slices: Slices, lights: list[SphereLight], points: dict[str, Array], _: Surface
-) -> Float[Array, "*batch_colour"]:
-    colour = np.broadcast_shapes(slices.colour, *(light.colour for light in lights))
-    return by_device(shade_points, points, _shade, slices, lights, colour)
-
-
-PATH = Path(slices_everywhere, radiance, local=True)
 
 
 @eqx.filter_jit
@@ -57,3 +44,6 @@ def _shade(
         return sum_lights(of_light, stacks, zero)
 
     return shade_tiles(slices, points, colour, 1024, of_tile, stacks)
+
+
+PATH = local_path(slices_everywhere, _shade)

@@ -18,7 +18,7 @@ from shisd.harmonics.internal import bands, zonal_norms
 from shisd.models import ZonalLight
 from shisd.shading._material import slices_everywhere
 from shisd.shading._surface import Surface
-from shisd.shading._tiles import shade_points, shade_tiles, sum_lights
+from shisd.shading._tiles import padded, shade_points, shade_tiles, sum_lights
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices, lookup_table, slice_values
 
@@ -29,12 +29,8 @@ def radiance(
     size = 1 + min(slices.degree, max(light.degree for light in lights))
     colour = np.broadcast_shapes(*(light.colour for light in lights))
 
-    def own(light: ZonalLight) -> Float[Array, "*c l"]:
-        z = light.coefficients[..., :size]
-        z = jnp.pad(z, [(0, 0)] * (z.ndim - 1) + [(0, size - z.shape[-1])])
-        return jnp.broadcast_to(z, (*colour, size))
-
-    axes, z = jnp.stack([light.axis for light in lights]), jnp.stack([own(light) for light in lights])
+    axes = jnp.stack([light.axis for light in lights])
+    z = jnp.stack([padded(light.coefficients, size, colour) for light in lights])
     colour = np.broadcast_shapes(slices.colour, colour)
     return by_device(shade_points, points, _shade, slices, normalize(axes), z, colour)
 

@@ -135,13 +135,12 @@ def by_convergence(
 
 @eqx.filter_jit
 def _resolved(values: Pytree, error: Scalar, nodes: int, tolerance: float) -> Pytree:
-    return eqx.error_if(
-        values,
-        ~(error <= tolerance),
+    message = (
         f"The quadrature does not resolve this material: by `quadrature` {nodes} its estimated error is above "
         f"`tolerance` {tolerance:.2g}, or the material is not finite. Under jit and grad no other rule can be tried: "
-        f"pass `quadrature={3 * nodes // 2}`, a larger tolerance, or throw=False and read `error`.",
+        f"pass `quadrature={3 * nodes // 2}`, a larger tolerance, or throw=False and read `error`."
     )
+    return _checks.held(values, lambda one: eqx.error_if(one, ~(error <= tolerance), message))
 
 
 def slices_at(
