@@ -1,5 +1,6 @@
 """Settings of every test: shape checks on, both precisions by fixture, no silent promotion of types or ranks."""
 
+import gc
 import os
 import platform
 
@@ -23,6 +24,8 @@ if "SHISD_TESTS_AS_USERS" not in os.environ:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} {_FLAGS}")
             jax.devices()
+
+gc.set_threshold(200_000, 50, 1000)  # tracing makes very many objects that stay: less often is 5 % less time
 
 _HOOK = jaxtyping.install_import_hook("shisd", "beartype.beartype")  # before the package is imported anywhere
 

@@ -86,8 +86,10 @@ def _indices(triangles: ArrayLike) -> Array:
     array = _checks.any_array("triangles", triangles)
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"`triangles` must be integers [...]; got dtype {array.dtype}.")
-    if not isinstance(triangles, jax.Array) and np.any(np.asarray(triangles) != np.asarray(array)):
-        raise ValueError(f"`triangles` must fit into {array.dtype}; got up to {np.max(np.abs(triangles))}.")
+    if not isinstance(triangles, jax.Array):
+        given = np.asarray(triangles)  # `array` may be traced
+        if np.any(given != given.astype(array.dtype)):
+            raise ValueError(f"`triangles` must fit into {array.dtype}; got up to {np.max(np.abs(given))}.")
     return array
 
 

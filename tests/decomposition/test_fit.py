@@ -108,6 +108,7 @@ def test_wrong_lobes(as_user):
 # --- fits -------------------------------------------------------------------------------------------------------------
 
 
+@FLOAT32_FIRST
 @pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_fit_finds_the_truth(count, dtype):
     truth = mixture(dtype, count)

@@ -75,7 +75,13 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("material", MATERIALS)
+EACH = [(material, dtype) for material in MATERIALS for dtype in ("float32", "float64")]
+REPEATED = (("diffuse", "float32"), ("brushed", "float32"))  # the other precision is by default
+
+
+@pytest.mark.parametrize(
+    ("material", "dtype"), [pytest.param(*e, marks=SLOW) if e in REPEATED else e for e in EACH], indirect=["dtype"]
+)
 def test_radiance_is_equation_22(material, dtype, rng):
     slices = slices_of(material, dtype)
     light, normals, views, tangents = scene(rng, COUNT, dtype)
@@ -153,7 +159,7 @@ def test_derivatives_in_every_argument(material, x64, rng):
         return shade(own, light, normals, views, tangents)
 
     arguments = (light, normals, views, tangents, basis().directions)
-    check_grads(radiance, arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
+    check_grads(jax.jit(radiance), arguments, order=1, atol=1e-5, rtol=1e-5, eps=1e-5)
 
 
 @pytest.mark.slow
@@ -167,13 +173,15 @@ def test_second_derivatives_in_the_geometry(x64, rng):
 OCCT = lambda roughness: models.CookTorrance(roughness, 0.3, [0.7, 0.5, 0.2])
 
 
-@pytest.mark.parametrize("brdf", [pytest.param(models.Ggx, id="ggx"), pytest.param(OCCT, id="occt", marks=SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("brdf", [models.Ggx, OCCT], ids=["ggx", "occt"])
 def test_derivative_in_the_material(brdf, x64, rng):
     light, normals, views, _ = (jnp.asarray(a) for a in scene(rng, 3, np.float64))
     radiance = lambda alpha: shade(tabulate(brdf(alpha), throw=False), light, normals, views)
     check_grads(radiance, (jnp.asarray(0.45),), order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-5, eps=1e-4)
 
 
+@pytest.mark.slow
 def test_one_gradient_from_material_and_light_to_a_loss(x64, rng):
     """The chain that fits use: parameters of an anisotropic material -> slices -> picture -> loss."""
     light, normals, views, tangents = (jnp.asarray(a) for a in scene(rng, 4, np.float64))

@@ -294,6 +294,7 @@ def test_code_does_not_grow_with_lights_and_colours(rng):
     assert rgb < 1.1 * one
 
 
+@pytest.mark.slow
 def test_gradients_keep_no_tile_of_each_light(rng):
     surface = surface_of(*scene(rng, 2048))
     quads = np.stack([QUAD + i for i in range(20)]).astype(np.float32)

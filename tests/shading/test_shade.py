@@ -66,9 +66,9 @@ def test_lights_of_mixed_kinds_add_up(colour, dtype, rng):
         assert np.min(np.max(np.abs(value.reshape(5, -1)), axis=1)) > 1e-3, name  # they are lit
         assert np.array_equal(shade(name), value)
     close(shade(*lights), sum(v if v.ndim == 2 else v[:, None] for v in single.values()))
-    grey = [name for name, light in lights.items() if light.colour == ()]
-    assert shade(*grey).shape == (5, *colour)
-    close(shade(*grey), sum(single[name] for name in grey))
+    grey = shade("grey map", "ball")
+    assert lights["grey map"].colour == lights["ball"].colour == () and grey.shape == (5, *colour)
+    close(grey, single["grey map"] + single["ball"])
 
 
 def test_sequences_batches_and_jit(rng):

@@ -91,6 +91,9 @@ EACH = {  # what shades, its light, and which arrays of points it takes
 }
 
 
+NAMES = [pytest.param(name, marks=pytest.mark.slow) if name == "several" else name for name in EACH]
+
+
 @functools.cache
 def compiled(name):
     """Values and gradients of their sum, by light and points."""
@@ -121,7 +124,7 @@ def some_points(rng):
     return {k: x.astype(np.float32) for k, x in points.items()}
 
 
-@pytest.mark.parametrize("name", EACH)
+@pytest.mark.parametrize("name", NAMES)
 def test_nan_stays_nan(name, rng):
     """In value and in every gradient, of the points that have it or of all; a zero direction is one too."""
     light, points, names = EACH[name][1], some_points(rng), EACH[name][2]
@@ -145,7 +148,7 @@ def test_nan_stays_nan(name, rng):
         assert np.all(np.isnan(by_points[where])), where
 
 
-@pytest.mark.parametrize("name", EACH)
+@pytest.mark.parametrize("name", NAMES)
 def test_masks(name, rng):
     """0 with gradient 0, whatever stands there; the rest, and gradients of the light, as without these points."""
     light, points, mask = EACH[name][1], some_points(rng), np.array([False, True, False, True])
@@ -163,7 +166,7 @@ def test_masks(name, rng):
         np.testing.assert_array_equal(x, 0)
 
 
-@pytest.mark.parametrize("name", [name for name, (_, _, points) in EACH.items() if "views" in points])
+@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("projected", "mirror", "anisotropic mirror")])
 def test_a_view_on_the_horizon_sees_nothing(name, rng):
     points = some_points(rng)
     points["normals"], points["tangents"] = np.float32([[0, 0, 2]] * COUNT), np.float32([[1, 0.5, 0]] * COUNT)
@@ -212,3 +215,12 @@ def test_masks_are_named_where_they_are_wrong(as_user):
     with pytest.raises(ValueError, match="`mask` .* do not broadcast"):
         footprint = shading.Footprint(n, np.ones((3, 3, 2), np.float32))
         shading.reflect(footprint, models.DistantLight(HARMONICS), mask=np.ones(2, bool))
+
+
+def test_indices_that_the_precision_cannot_hold_are_refused_also_inside_compiled_code(as_user):
+    at = {"normals": [0, 0, 1.0], "views": [0, 0, 1.0], "barycentric": [1.0, 0, 0]}
+    for wrap in (lambda f: f, jax.jit):
+        kept = wrap(lambda: shading.Surface(**at, triangles=np.array([2**31 - 1])).triangles)()
+        assert kept.dtype == np.int32 and kept == 2**31 - 1
+        with pytest.raises(ValueError, match=r"^`triangles` must fit into int32; got up to 2147483648\.$"):
+            wrap(lambda: shading.Surface(**at, triangles=np.array([2**31])).triangles)()
