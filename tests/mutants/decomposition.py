@@ -78,7 +78,7 @@ MUTANTS = [
         "shisd/decomposition/_fit.py",
         old="return error2(columns, a) + ridge",
         new="return error2(jax.lax.stop_gradient(columns), a) + ridge",
-        test="tests/decomposition/test_fit.py::test_a_fit_finds_the_truth[float32-3]",
+        test="tests/decomposition/test_fit.py::test_a_fit_finds_the_truth[3-float32]",
     ),
     Mutant(
         "fits that square before they scale",

@@ -94,7 +94,7 @@ MUTANTS = [
     Mutant(
         "light turned the wrong way", "shisd/shading/paths/_distant.py",
         old="to_local = jnp.swapaxes(frame, 1, 2)", new="to_local = frame",
-        test="tests/shading/test_environment.py::test_radiance_is_equation_22[float32-diffuse]",
+        test="tests/shading/test_environment.py::test_radiance_is_equation_22[diffuse-float32]",
     ),
     Mutant(
         "norms of zonal light", "shisd/shading/paths/_zonal.py",
