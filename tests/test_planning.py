@@ -225,6 +225,20 @@ def test_derivatives_in_the_geometry(material, x64, rng):
     check_grads(shade, where, order=1, modes=["rev"], atol=1e-5, rtol=1e-5, eps=1e-5)
 
 
+@pytest.mark.parametrize("material", MATERIALS)
+def test_what_has_no_direction_has_no_radiance(material, rng):
+    """Whichever path is taken: NaN, and others as without it."""
+    positions, normals, views = pixels(rng, 6)
+    clean = planned().shade(material, surface(positions, normals, views))
+    for i in range(2):
+        for bad in (0, np.nan):
+            arrays = [np.array(normals), np.array(views)]
+            arrays[i][2] = bad
+            value = np.asarray(planned().shade(material, surface(positions, *arrays)))
+            assert np.all(np.isnan(value[2]))
+            np.testing.assert_array_equal(np.delete(value, 2, axis=0), np.delete(clean, 2, axis=0))
+
+
 def test_errors_name_the_argument(as_user, rng):
     with pytest.raises(ValueError, match="at least one of `materials` and of `lights`; got 0 and 3"):
         planning.Scene({}, scene().lights)
@@ -256,7 +270,7 @@ def test_errors_name_the_argument(as_user, rng):
         planned().shade("gold", surface(positions, normals, views))
     with pytest.raises(ValueError, match="`surface` needs `positions`"):
         planned().shade("clay", shading.Surface(normals, views))
-    with pytest.raises(ValueError, match="`surface` must be a shading.Surface; got ndarray"):
+    with pytest.raises(ValueError, match="`surface` must be a shading.Surface of normals and views; got ndarray"):
         planned().shade("clay", positions)
     with pytest.raises(ValueError, match="do not broadcast"):
         planned().shade("clay", surface(positions, normals[:2], views))

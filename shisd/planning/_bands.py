@@ -136,7 +136,11 @@ Seen = Distant | Local
 
 
 def known_material(brdf: AbstractBrdf, degree: int, elevations: int) -> Material:
-    """Slices to a degree, seen from Gauss nodes in elevation; `elevations` as in `Material`."""
+    """Slices to a degree, seen from Gauss nodes in elevation; `elevations` as in `Material`.
+
+    Apart from the table that a plan makes: one for both, of 64 elevations to this degree, would take 5 times as long
+    (GGX 0.3, RGB, degree 60 beside a table of degree 16: 7.0 s against 0.84 s and 0.54 s, compiled).
+    """
     nodes, weights = np.polynomial.legendre.leggauss(_ELEVATIONS)
     azimuths = np.arange(1 if brdf.isotropic else _AZIMUTHS) / _AZIMUTHS
     theta, phi = (x.ravel() for x in np.meshgrid((nodes + 1) * np.pi / 4, 2 * np.pi * azimuths, indexing="ij"))

@@ -1,6 +1,5 @@
 """The choice: for each material and light the cheapest path at the smallest degree, as a table and as what shades."""
 
-import functools
 import warnings
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from shisd.planning._paths import PATHS, Irradiance, Path, Table
 from shisd.planning._prediction import Choice, judge
 from shisd.planning._scene import Scene
 from shisd.shading import Surface, tabulate_brdf
-from shisd.shading.internal import as_type
+from shisd.shading.internal import as_type, check_surface, sum_parts
 
 
 class Entry(NamedTuple):
@@ -63,8 +62,7 @@ class Plan(Module):
         """
         if material not in self.paths:
             raise ValueError(f"`material` must be one of {', '.join(map(repr, self.paths))}; got {material!r}.")
-        if not isinstance(surface, Surface):
-            raise ValueError(f"`surface` must be a shading.Surface; got {type(surface).__name__}.")
+        check_surface(surface)
         return _shade(self.paths[material], surface)
 
     def __str__(self) -> str:
@@ -197,9 +195,8 @@ def _join(
 @eqx.filter_jit
 def _shade(paths: tuple[Path, ...], surface: Surface) -> Float[Array, "*batch_colour"]:
     surface = _whole(surface)
-    values = [path.shade(surface) for path in paths]
-    most = max(value.ndim for value in values)
-    return functools.reduce(jnp.add, (v.reshape(*v.shape, *(1,) * (most - v.ndim)) for v in values))
+    batch = surface.normals.ndim - 1
+    return sum_parts((value, value.shape[batch:]) for value in (path.shade(surface) for path in paths))
 
 
 def _whole(surface: Surface) -> Surface:

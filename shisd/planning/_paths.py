@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd._module import Module
+from shisd._numerics import normalize
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import convolve, evaluate
@@ -181,8 +182,8 @@ PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal)
 def _irradiance(points: dict[str, Float[Array, "p 3"]], c: Float[Array, "*colour n"]) -> Float[Array, " p *colour"]:
     normals, views = points["normals"], points["views"]
     values = evaluate(c.reshape(-1, 1, c.shape[-1]), normals).T.reshape(-1, *c.shape[:-1])
-    below = jnp.sum(normals * views, axis=-1) <= 0
-    return jnp.where(below.reshape(-1, *(1,) * (values.ndim - 1)), 0, values)
+    height = jnp.sum(normalize(normals) * normalize(views), axis=-1).reshape(-1, *(1,) * (values.ndim - 1))
+    return jnp.where(height <= 0, 0, values + 0 * height)  # NaN of what has no direction
 
 
 def _sum(lights: list[Distant], degree: int) -> Float[Array, "*colour n"]:

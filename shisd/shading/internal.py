@@ -1,7 +1,9 @@
-"""What planning takes from inside shading: slices of materials before they are tables, batches of points."""
+"""What planning takes from inside shading: slices before they are tables, batches of points, sums of radiance."""
 
+from shisd.shading._surface import check_surface as check_surface
 from shisd.shading._tiles import as_type as as_type
 from shisd.shading._tiles import shade_points as shade_points
+from shisd.shading._tiles import sum_parts as sum_parts
 from shisd.shading.slices._tabulate import project_slice as project_slice
 from shisd.shading.slices._upper import RIDGE as RIDGE
 from shisd.shading.slices._upper import hemisphere_blocks as hemisphere_blocks
