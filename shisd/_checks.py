@@ -79,10 +79,16 @@ def coefficients(name: str, value: ArrayLike) -> tuple[Array, int]:
     """`value` as floating SH coefficients [..., (L+1)^2], and the degree L."""
     array = real_array(name, value)
     size = array.shape[-1] if array.ndim else 0
-    degree = degree_of(size)
-    if degree < 0 or (degree + 1) ** 2 != size:
-        raise ValueError(f"`{name}` must have (degree + 1)**2 coefficients on its last axis; got {list(array.shape)}.")
-    return array, degree
+    if not is_square(size):
+        hint = " Colours come first: pass its transpose." if array.ndim == 2 and is_square(array.shape[0]) else ""
+        raise ValueError(
+            f"`{name}` must have (degree + 1)**2 coefficients on its last axis; got {list(array.shape)}.{hint}"
+        )
+    return array, degree_of(size)
+
+
+def is_square(size: int) -> bool:
+    return size > 0 and math.isqrt(size) ** 2 == size
 
 
 def expansion(name: str, value: ArrayLike) -> tuple[Array, int]:

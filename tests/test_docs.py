@@ -79,10 +79,16 @@ def test_generated_tables_stand_between_markers():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", PROGRAMS[1:], ids=name)
-def test_code_runs(path):
+def test_code_runs(path, tmp_path):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        [sys.executable, "-c", program(path)], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600
+        [sys.executable, "-c", program(path)],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
 

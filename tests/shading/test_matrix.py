@@ -199,6 +199,23 @@ def test_lambertian(x64):
     assert upper.needed_degree(1e-3) == 1  # cos is of degree 1 above the horizon
 
 
+@pytest.mark.parametrize("colour", [(), (3,)])
+def test_degree_of_slices_with_azimuths_counts_all_of_them(colour, rng):
+    theta = (np.arange(4) + 0.5) * np.pi / 8
+    c = rng.normal(size=(*colour, 4, 6, 16)) * np.repeat([1, 0.5, 0.2, 0.01], [1, 3, 5, 7])
+    energy = np.add.reduceat(c**2, np.arange(4) ** 2, axis=-1).reshape(-1, 4, 6, 4)
+    slices = shading.Slices(c.astype(np.float32), isotropic=False)
+    shares = np.sin(2 * theta)[:, None, None]
+    for worst, energies in ((False, np.sum(shares * energy, axis=(1, 2))), (True, energy.reshape(-1, 4))):
+        left = np.max(np.sqrt(1 - np.cumsum(energies, axis=-1) / np.sum(energies, axis=-1, keepdims=True)), axis=0)
+        assert slices.needed_degree(1.001 * left[0], worst=worst) == 0
+        assert (
+            slices.needed_degree(0.999 * left[0], worst=worst)
+            == slices.needed_degree(1.001 * left[1], worst=worst)
+            == 1
+        )
+
+
 @pytest.mark.slow
 def test_degree_is_the_same_from_table_and_matrix():
     table, matrix = both_of("sphere", SINGLE)

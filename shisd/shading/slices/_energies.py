@@ -26,7 +26,7 @@ def needed_degree(energies: np.ndarray, tolerance: float, worst: bool) -> int:
     """The smallest degree that leaves at most `tolerance` of the RMS, or of the worst view, by [colour, V, (A,) l]."""
     if not worst:
         share = np.sin(2 * _views.elevations(energies.shape[1]))  # of a sphere's picture
-        energies = np.einsum("v,cv...l->cl", share, energies)
+        energies = np.einsum("v,cval->cl", share, energies.reshape(*energies.shape[:2], -1, energies.shape[-1]))
     above = np.cumsum(energies[..., ::-1], axis=-1)[..., ::-1]  # of bands l and higher
     needed = np.any(above > tolerance**2 * above[..., :1], axis=tuple(range(above.ndim - 1)))
     return max(int(np.count_nonzero(needed)) - 1, 0)
