@@ -75,7 +75,7 @@ def times(a: Array, b: Array) -> Array:
 
 
 def rows_of(x: Float[Array, " p"], factors: np.ndarray) -> Float[Array, "n p"]:
-    """x times every factor, as a product of matrices: its transpose is one too, not a sum, which XLA does slowly."""
+    """x times every factor, as a product of matrices, as is its transpose."""
     return jnp.asarray(factors[:, None], x.dtype) @ x[None]
 
 

@@ -104,7 +104,7 @@ def basis_at(u: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch n
         for cos, sin in angles_of(u.reshape(-1, 3)).reshape(2, 2, -1)
     )
     polar = theta.T @ series
-    # A product with a 0-1 matrix, not an indexed copy: XLA would fuse the copy into its use and evaluate it per output.
+    # a product with a 0-1 matrix, not an indexed copy, so that angles are not made again for every coefficient
     azimuth = phi.T @ factors
     return (polar * azimuth[:, _layout.orders(degree) + degree]).reshape(*u.shape[:-1], (degree + 1) ** 2)
 

@@ -92,7 +92,7 @@ def _monte_carlo(
     splits = np.cumsum(cells)[:-1]
     sizes = [2.0 * n for n in cells]
 
-    def one(point: tuple[Array, ...]) -> tuple[Array, Array]:  # barriers stop XLA from repeating work
+    def one(point: tuple[Array, ...]) -> tuple[Array, Array]:  # barriers keep work from being repeated
         frame, wo, start, key = point
         jitter = jax.random.uniform(key, (2, sum(cells), 2), views.dtype)  # two independent points in every cell
         u = jax.lax.optimization_barrier(corners + widths * jitter)

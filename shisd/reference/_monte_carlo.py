@@ -92,7 +92,7 @@ def _invert(cdf: Array, row: Array, u: Array) -> tuple[Array, Array]:
 
     bins = cdf.shape[1] - 1
     bounds = jnp.zeros_like(row), jnp.full_like(row, bins)
-    low, high = jax.lax.fori_loop(0, math.ceil(math.log2(bins)), halve, bounds)  # a loop keeps XLA from recomputing it
+    low, high = jax.lax.fori_loop(0, math.ceil(math.log2(bins)), halve, bounds)  # a loop, so that it is computed once
     start, stop = cdf[row, low], cdf[row, high]
     return low, (u - start) / (stop - start)
 

@@ -35,7 +35,7 @@ def shade(
     Arguments: `material` from `prepare`, or `Slices` or a `BrdfMatrix` that one made oneself; `lights`, one or a
     sequence of `models.DistantLight`, `ZonalLight`, `Occluded`, `SphereLight`, `PolygonLight`, `PortalLight`;
     `surface`, with `positions` where a light is local and `tangents` where the material is anisotropic. Colours of
-    material and lights broadcast: none or RGB. Returns [..., *colour] in W/(m2 sr), or the lights' unit.
+    material and lights: as many, or none of one. Returns [..., *colour] in W/(m2 sr), or the lights' unit.
     What lies below the horizon of a point adds nothing. A view that is not above the horizon gives 0; a light seen from
     behind adds 0, with gradient 0. A NaN anywhere, a zero normal or view, a ball of no size, and a tangent along the
     normal give NaN, with NaN gradients. Nothing casts shadows but `Occluded`.

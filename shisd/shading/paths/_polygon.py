@@ -121,7 +121,7 @@ def _up(v: Loop) -> Float[Array, "3 p"]:
 
 
 def _in_frame(frame: Float[Array, "p 3 3"], v: Loop) -> Loop:
-    """frame^T v, written out: XLA has no fast code for many small products."""
+    """frame^T v, written out: as an einsum the gradient of a lamp takes 1.5 times as long (degree 8, jax 0.10.2)."""
     return jnp.stack([dot(axis[:, None], v) for axis in jnp.moveaxis(frame, 0, -1).swapaxes(0, 1)])
 
 
