@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import harmonics, models, shading
+from shisd.harmonics.internal import bands
 from shisd.shading.slices._tabulate import project_slice
-
-BANDS = harmonics._tables.bands
 
 
 def local_frames(normals, views):
@@ -36,7 +35,7 @@ def interpolated_weights(weights, theta):
 
 def literal(basis, table, light):
     degree = basis.degree
-    convolved = light * jnp.asarray(np.sqrt(4 * np.pi / (2 * BANDS(degree) + 1)), light.dtype)
+    convolved = light * jnp.asarray(np.sqrt(4 * np.pi / (2 * bands(degree) + 1)), light.dtype)
 
     def pixel(normal, view):
         frame, theta = local_frames(normal, view)
@@ -55,7 +54,7 @@ def tables(basis, table, light, height):
     degree = basis.degree
     scale = np.sqrt(4 * np.pi / (2 * np.arange(degree + 1) + 1))
     split = light[:, None, :] * jnp.asarray(
-        (BANDS(degree) == np.arange(degree + 1)[:, None]) * scale[:, None], light.dtype
+        (bands(degree) == np.arange(degree + 1)[:, None]) * scale[:, None], light.dtype
     )
     maps = harmonics.synthesize_map(split.reshape(-1, split.shape[-1]), height, 2 * height)  # [H, 2H, 3 * (L+1)]
     maps = jnp.concatenate([jnp.roll(maps[:1], height, 1), maps, jnp.roll(maps[-1:], height, 1)])  # across the poles

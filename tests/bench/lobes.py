@@ -27,7 +27,7 @@ from shisd._numerics import normalize
 from shisd.decomposition._fit import lobe_starts
 from shisd.decomposition._kernels import gaussian_zonal
 from shisd.io.internal import write_atomically
-from shisd.shading import _surface, _views
+from shisd.shading import _tiles, _views
 from shisd.shading.slices import _tabulate
 from tests.bench.equation_22 import local_frames
 from tests.bench.monte_carlo import arccos, arctan2
@@ -277,7 +277,7 @@ def shade_gaussians(table, pyramid, normals, views):
                 total += weight[..., corner, None] * texels.at[index[..., corner]].get(mode="promise_in_bounds")
         return jnp.einsum("ckp,kpc->pc", weights, total[..., :3])
 
-    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 4096)
+    return _tiles.in_tiles(tile, {"normals": normals, "views": views}, 4096)
 
 
 def band_table(environment, degree, height=128):
@@ -300,7 +300,7 @@ def shade_profiles(table, texels, normals, views, at, height=128):
         value = value.reshape(*value.shape[:2], -1, 3)
         return jnp.einsum("pclk,pklc->pc", lobes.weights, value)
 
-    return _surface.in_tiles(tile, {"normals": normals, "views": views}, 256)
+    return _tiles.in_tiles(tile, {"normals": normals, "views": views}, 256)
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
 """Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--pages].
 
 Writes DIR/report.json with every row, DIR/report.md with tables, and a figure for each group of tasks to DIR/figures;
---pages also puts both into docs/ and the short tables between the markers of docs/benchmarks.md. `make report` sets the
-allocator.
+--pages also puts both into docs/, the short tables between the markers of docs/benchmarks.md, and an entry at the end
+of docs/history.json. `make report` sets the allocator.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from shisd.io.internal import write_atomically
-from tests.bench import applications, environments, harness, local_lights, renderers, roofline, spherical
+from tests.bench import applications, environments, harness, history, local_lights, renderers, roofline, spherical
 from tests.bench.run import DOCS, paste, table
 
 GROUPS = {  # name: (title, tasks)
@@ -75,7 +75,8 @@ def main() -> None:
     wanted = arguments.only or [name for name in (*GROUPS, *TABLES) if name not in APART]
     allocator = "tuned" if os.environ.get("MALLOC_MMAP_MAX_") == "0" else "default"
     note = f"{os.cpu_count()} cores, jax {jax.__version__}, default XLA flags, {allocator} allocator."
-    results, sections, start = {"machine": note, "rows": []}, {}, time.perf_counter()
+    whole = note + " Few tasks and settings." if arguments.quick else note
+    results, sections, start = {"machine": whole, "rows": []}, {}, time.perf_counter()
 
     def keep(name: str, short: str, long: str) -> None:
         sections[name] = short, long
@@ -129,6 +130,8 @@ def main() -> None:
             write_atomically(DOCS / f"{name}.md", text, overwrite=True)
         if f"<!-- table:{name} -->" in (DOCS / "benchmarks.md").read_text():
             paste(name, short)
+    if arguments.pages and not (arguments.only or arguments.quick):
+        history.remember(results)
     print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")
 
 
