@@ -79,8 +79,8 @@ def basis_work(degree: int) -> dict[str, float]:
 def sphericart_of(degree: int, directions: np.ndarray) -> Callable:
     import sphericart
 
-    harmonics = sphericart.SphericalHarmonics(degree)
-    return lambda: harmonics.compute(directions)
+    peer = sphericart.SphericalHarmonics(degree)
+    return lambda: peer.compute(directions)
 
 
 def tables(quick: bool) -> dict[str, list[dict]]:
