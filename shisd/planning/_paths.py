@@ -15,7 +15,7 @@ from shisd.harmonics import convolve, evaluate
 from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
 from shisd.planning._bands import Distant, Local, Material
 from shisd.shading import Slices, Surface, shade
-from shisd.shading.internal import as_type, shade_points
+from shisd.shading.internal import as_type, finite_mark, finite_or_nan, shade_points
 
 
 class Path(Module):
@@ -182,8 +182,9 @@ PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal)
 def _irradiance(points: dict[str, Float[Array, "p 3"]], c: Float[Array, "*colour n"]) -> Float[Array, " p *colour"]:
     normals, views = points["normals"], points["views"]
     values = evaluate(c.reshape(-1, 1, c.shape[-1]), normals).T.reshape(-1, *c.shape[:-1])
-    height = jnp.sum(normalize(normals) * normalize(views), axis=-1).reshape(-1, *(1,) * (values.ndim - 1))
-    return jnp.where(height <= 0, 0, values + 0 * height)  # NaN of what has no direction
+    own = normalize(normals), normalize(views)  # NaN of what has no direction
+    below = jnp.sum(own[0] * own[1], axis=-1) <= 0
+    return finite_or_nan(jnp.where(below.reshape(-1, *(1,) * (values.ndim - 1)), 0, values), own, finite_mark(c))
 
 
 def _sum(lights: list[Distant], degree: int) -> Float[Array, "*colour n"]:

@@ -2,6 +2,8 @@
 
 from shisd.shading._surface import check_surface as check_surface
 from shisd.shading._tiles import as_type as as_type
+from shisd.shading._tiles import finite_mark as finite_mark
+from shisd.shading._tiles import finite_or_nan as finite_or_nan
 from shisd.shading._tiles import shade_points as shade_points
 from shisd.shading._tiles import sum_parts as sum_parts
 from shisd.shading.slices._tabulate import project_slice as project_slice

@@ -19,14 +19,14 @@ HISTORY = Path(__file__).resolve().parents[2] / "docs" / "history.json"
 def entry(report: dict) -> dict:
     """A report, cut to what is compared later; numbers to three digits."""
     short = lambda x: float(f"{x:.3g}") if isinstance(x, float) else x
-    methods: dict[str, dict[str, list]] = {}
+    tasks: dict[str, dict[str, list]] = {}
     for row in report["rows"]:
         (time,) = (key for key in row if key.startswith("us/"))
         numbers = [short(row[key]) for key in (time, "with gradient", "relative RMSE")]
-        methods.setdefault(row["task"], {})[f"{row['family']}, {row['setting']}"] = numbers
+        tasks.setdefault(row["task"], {})[f"{row['family']}, {row['setting']}"] = numbers
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     columns = ["us", "us with gradient", "relative RMSE"]
-    return {"date": today, "shisd": shisd.__version__, "machine": report["machine"], "columns": columns, **methods}
+    return {"date": today, "shisd": shisd.__version__, "machine": report["machine"], "columns": columns, "tasks": tasks}
 
 
 def remember(report: dict, path: Path = HISTORY) -> None:

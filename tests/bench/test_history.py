@@ -21,13 +21,13 @@ def test_a_report_becomes_the_last_entry(tmp_path):
     history.remember({"machine": "2 cores", "rows": rows}, path)
     first, last = json.loads(path.read_text())
     assert first == {"date": "2026-01-01"}
-    assert last["a room"] == {"ours, degree 4": [1.23, None, 0.0123], "ours, degree 8": [2.0, None, 0.001]}
-    assert last["a sun"] == {"ours, one": [4.0, None, 0.0]} and last["machine"] == "2 cores"
+    assert last["tasks"]["a room"] == {"ours, degree 4": [1.23, None, 0.0123], "ours, degree 8": [2.0, None, 0.001]}
+    assert last["tasks"]["a sun"] == {"ours, one": [4.0, None, 0.0]} and last["machine"] == "2 cores"
 
 
 def test_the_stored_history_has_one_form():
     entries = json.loads(history.HISTORY.read_text())
     assert entries and [e["date"] for e in entries] == sorted(e["date"] for e in entries)
     for entry in entries:
-        tasks = [task for task in entry.values() if isinstance(task, dict)]
-        assert tasks and all(len(numbers) == len(entry["columns"]) for task in tasks for numbers in task.values())
+        rows = [numbers for task in entry["tasks"].values() for numbers in task.values()]
+        assert rows and all(len(numbers) == len(entry["columns"]) for numbers in rows)

@@ -1,11 +1,12 @@
 """Benchmarks and examples name what is in the package: they run too seldom to find out otherwise."""
 
 import ast
-import importlib
+import pkgutil
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+
+from tests.test_layering import imported, read
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = [*sorted((ROOT / "tests" / "bench").glob("*.py")), *sorted((ROOT / "examples").glob("*.py"))]
@@ -13,22 +14,20 @@ FILES = [*sorted((ROOT / "tests" / "bench").glob("*.py")), *sorted((ROOT / "exam
 
 def wrong(source: str) -> list[str]:
     """Names of the package that a file imports, or reads off what it imports, and that are not there."""
-    tree, bound, missing = ast.parse(source), {}, []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "shisd":
-            module = importlib.import_module(node.module or "")
-            for alias in node.names:
-                if hasattr(module, alias.name):
-                    bound[alias.asname or alias.name] = getattr(module, alias.name)
-                else:
-                    missing.append(f"{node.module}.{alias.name}")
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            thing = bound.get(node.value.id)
-            if isinstance(thing, ModuleType | type) and not hasattr(thing, node.attr):
-                annotated = getattr(thing, "__annotations__", {})
-                missing += [] if node.attr in annotated else [ast.unparse(node)]
-    return missing
+    tree = ast.parse(source)
+    bound = {word: name for word, name in imported(tree) if name.split(".")[0] == "shisd"}
+    words = [(word, text) for text in read(tree) if (word := text.split(".")[0]) in bound]
+    return [name for name in (*bound.values(), *(bound[w] + t[len(w) :] for w, t in words)) if not there(name)]
+
+
+def there(name: str) -> bool:
+    """Whether a.b.c can be read, or is a field, which only instances have."""
+    try:
+        pkgutil.resolve_name(name)
+    except AttributeError:
+        owner, _, last = name.rpartition(".")
+        return there(owner) and last in getattr(pkgutil.resolve_name(owner), "__annotations__", {})
+    return True
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
@@ -38,4 +37,4 @@ def test_names_are_there(path):
 
 def test_a_name_that_has_gone_is_found():
     source = "from shisd import shading\nfrom shisd.models import Gone\nshading.shade\nshading.shade_polygon(1)\n"
-    assert wrong(source) == ["shisd.models.Gone", "shading.shade_polygon"]
+    assert wrong(source) == ["shisd.models.Gone", "shisd.shading.shade_polygon"]

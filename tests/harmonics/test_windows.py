@@ -123,6 +123,7 @@ def test_a_mean_below_the_floor_is_an_error_of_the_gradient_too(x64):
         jax.block_until_ready(gradient(jnp.asarray(expansions(float)[3])))
 
 
+@pytest.mark.slow
 def test_what_is_above_the_floor_has_the_gradient_of_the_identity(x64):
     gradient = jax.grad(lambda c: harmonics.dering(c).coefficients[3:].sum())(jnp.asarray(expansions(float)[2]))
     np.testing.assert_allclose(gradient, np.arange(16) >= 3)

@@ -91,7 +91,10 @@ EACH = {  # what shades, its light, and which arrays of points it takes
 }
 
 
-NAMES = [pytest.param(name, marks=pytest.mark.slow) if name == "several" else name for name in EACH]
+def cases(*arrays):
+    """The names of those that take these arrays of points; several lights, each of which is there alone, are slow."""
+    slow = {"several": pytest.mark.slow}
+    return [pytest.param(n, marks=slow.get(n, ())) for n, (_, _, points) in EACH.items() if {*arrays} <= {*points}]
 
 
 @functools.cache
@@ -124,7 +127,7 @@ def some_points(rng):
     return {k: x.astype(np.float32) for k, x in points.items()}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", cases())
 def test_nan_stays_nan(name, rng):
     """In value and in every gradient, of the points that have it or of all; a zero direction is one too."""
     light, points, names = EACH[name][1], some_points(rng), EACH[name][2]
@@ -148,7 +151,7 @@ def test_nan_stays_nan(name, rng):
         assert np.all(np.isnan(by_points[where])), where
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", cases())
 def test_masks(name, rng):
     """0 with gradient 0, whatever stands there; the rest, and gradients of the light, as without these points."""
     light, points, mask = EACH[name][1], some_points(rng), np.array([False, True, False, True])
@@ -166,7 +169,7 @@ def test_masks(name, rng):
         np.testing.assert_array_equal(x, 0)
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("projected", "mirror", "anisotropic mirror")])
+@pytest.mark.parametrize("name", cases("views"))
 def test_a_view_on_the_horizon_sees_nothing(name, rng):
     points = some_points(rng)
     points["normals"], points["tangents"] = np.float32([[0, 0, 2]] * COUNT), np.float32([[1, 0.5, 0]] * COUNT)
