@@ -12,6 +12,7 @@ from jax.test_util import check_grads
 from shisd import domains, models, reference, shading
 from tests import truth
 from tests.hard_cases import unit
+from tests.marks import FLOAT64_FIRST
 from tests.shading.slices import cosine_slices, random_slices
 
 QUAD = np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]])  # emits downwards
@@ -154,6 +155,7 @@ def check_slope(gradient, move, want, dtype, name):
     np.testing.assert_allclose(np.sum(parts), want, rtol=0, atol=tolerance, err_msg=name)
 
 
+@FLOAT64_FIRST
 def test_values_and_gradients_of_the_slice(dtype, rng):
     """The clipped integral of the interpolated slice and its change with outline, position, normal and view."""
     slices, geometry, weights = random(dtype.name), [QUAD, *scene(rng)], rng.normal(size=COUNT)

@@ -55,10 +55,15 @@ def close(got, expected):
     np.testing.assert_allclose(got, expected, atol=bound(got.dtype) * np.max(np.abs(expected)))
 
 
+FEW = ("grey map", "low map", "sun", "occluded map", "occluded sky", "ball", "quad", "profiled")
+
+
 @FLOAT32_FIRST
 @pytest.mark.parametrize("colour", [(), pytest.param((3,), marks=pytest.mark.slow)])
 def test_lights_of_mixed_kinds_add_up(colour, dtype, rng):
+    """A few of them on grey slices, all on RGB ones."""
     slices, lights, surface = random_slices(DEGREE, dtype, colour), lights_of(rng, dtype), surface_of(rng, dtype)
+    lights = lights if colour else {name: lights[name] for name in FEW}
     shade = lambda *names: shading.shade(slices, [lights[name] for name in names], surface)
     single = {name: np.asarray(shading.shade(slices, light, surface)) for name, light in lights.items()}
     for name, value in single.items():
@@ -126,7 +131,7 @@ def test_a_prepared_material_has_the_slices_of_tabulate_brdf(kind):
 def test_each_light_takes_its_form_of_the_material(rng):
     material = made("isotropic", 3, local_degree=2)
     lights, surface = lights_of(rng, np.float32), surface_of(rng, np.float32)
-    for light in (lights[name] for name in ("map", "sky", "occluded map", "ball", "quad", "window")):
+    for light in (lights[name] for name in ("map", "occluded map", "ball", "quad")):
         form = material.local if isinstance(light, models.PolygonLight | models.PortalLight) else material.distant
         np.testing.assert_array_equal(shading.shade(material, light, surface), shading.shade(form, light, surface))
     pair = [lights["map"], lights["quad"]]

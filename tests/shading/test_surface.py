@@ -92,9 +92,12 @@ EACH = {  # what shades, its light, and which arrays of points it takes
 
 
 def cases(*arrays):
-    """The names of those that take these arrays of points; several lights, each of which is there alone, are slow."""
-    slow = {"several": pytest.mark.slow}
-    return [pytest.param(n, marks=slow.get(n, ())) for n, (_, _, points) in EACH.items() if {*arrays} <= {*points}]
+    """The names of those that take these arrays of points.
+
+    Slow: several lights, each of which is there alone, and portals, which share tiles and outlines with polygons.
+    """
+    mark = lambda name: pytest.mark.slow if name in ("several", "portal") else ()
+    return [pytest.param(n, marks=mark(n)) for n, (_, _, points) in EACH.items() if {*arrays} <= {*points}]
 
 
 @functools.cache
