@@ -104,11 +104,12 @@ def degree_of(size: int) -> int:
     return math.isqrt(size) - 1
 
 
-def outline(name: str, value: ArrayLike) -> Array:
-    """`value` as the floating points [S, 3] of a polygon."""
+def outline(name: str, value: ArrayLike, *, many: bool = False) -> Array:
+    """`value` as the floating points [S, 3] of a polygon, or [..., S, 3] of `many`."""
     array = vectors(name, value)
-    if array.ndim != 2 or array.shape[0] < 3:
-        raise ValueError(f"`{name}` must have shape [S, 3] with at least 3 points; got {list(array.shape)}.")
+    if array.ndim < 2 or (array.ndim > 2 and not many) or array.shape[-2] < 3:
+        form = "[..., S, 3]" if many else "[S, 3]"
+        raise ValueError(f"`{name}` must have shape {form} with at least 3 points; got {list(array.shape)}.")
     return array
 
 

@@ -18,10 +18,10 @@ import numpy as np
 
 from shisd import _checks
 from shisd._numerics import dot, normalize, same_dtype
-from shisd._typing import Array, ArrayLike, DTypeLike, Float
+from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.decomposition import fibonacci_directions, optimized_directions
 from shisd.decomposition.internal import TABLE_DEGREE
-from shisd.domains._polygon import SphericalPolygon, loop_solid_angle
+from shisd.domains._polygon import SphericalPolygon, for_each, loop_solid_angle
 from shisd.domains._region import SphericalCap, cap_coefficients, cap_integrals
 from shisd.domains.moments import Loop, fold, moments, powers
 from shisd.harmonics import legendre
@@ -30,11 +30,11 @@ from shisd.harmonics.internal import host_basis
 Region = SphericalPolygon | SphericalCap
 
 
-def zonal_moments(region: Region, axes: ArrayLike, degree: int) -> Float[Array, "k l"]:
+def zonal_moments(region: Region, axes: ArrayLike, degree: int) -> Float[Array, "*batch k l"]:
     """Integrals of P_l(w . axis) over a region, for every axis and l = 0 ... degree.
 
     Arguments: a `SphericalPolygon` or `SphericalCap`; `axes` [K, 3], of any length but zero; static `degree` L.
-    Returns [K, L+1] in sr.
+    Returns [K, L+1] in sr, or [..., K, L+1] of many polygons.
     Derivatives: in vertices and axes, both modes, any order; the first exact where vertices coincide and where an axis
     lies on a vertex or in the plane of an edge. Second derivatives at coincident vertices are finite but not the limit.
     Accuracy: error over solid angle at every degree up to 100, for axes at random. float64: 1e-13 for polygons above
@@ -51,10 +51,11 @@ def zonal_moments(region: Region, axes: ArrayLike, degree: int) -> Float[Array, 
     return _zonal_moments(region, d, degree)
 
 
-def axial_moments(polygon: SphericalPolygon, axes: ArrayLike, order: int) -> Float[Array, "k n"]:
+def axial_moments(polygon: SphericalPolygon, axes: ArrayLike, order: int) -> Float[Array, "*batch k n"]:
     """Integrals of the cosine powers (w . axis)^n over a polygon, n = 0 ... order (Arvo 1995; CSH18 section 4).
 
-    Arguments: `polygon`; `axes` [K, 3], of any length but zero; static `order` N. Returns [K, N+1] in sr.
+    Arguments: `polygon`; `axes` [K, 3], of any length but zero; static `order` N. Returns [K, N+1] in sr, or
+    [..., K, N+1] of many polygons.
     Sums of them with coefficients that alternate, such as those of Legendre polynomials, lose every digit near order 20
     in float32 and 40 in float64: use `zonal_moments` for these.
     Derivatives: in vertices and axes, both modes.
@@ -67,8 +68,10 @@ def axial_moments(polygon: SphericalPolygon, axes: ArrayLike, order: int) -> Flo
     return _axial_moments(polygon, d, order)
 
 
-def polygon_coefficients(region: Region, degree: int) -> Float[Array, " n"]:
+def polygon_coefficients(region: Region, degree: int) -> Float[Array, "*batch n"]:
     """SH coefficients of the indicator of a region: the integrals over it of every y_l^m, [(L+1)^2].
+
+    Returns [..., (L+1)^2] of many polygons.
 
     Derivatives: in the vertices, or axis and angle, as `zonal_moments`.
     Accuracy: 1e-11 in float64 and 2e-5 in float32 of the largest, at degree 20; 2e-2 for slivers in float32.
@@ -82,14 +85,17 @@ def polygon_coefficients(region: Region, degree: int) -> Float[Array, " n"]:
 def integrate(coefficients: ArrayLike, region: Region) -> Float[Array, "*batch"]:
     """The integral of SH expansions over a region (CSH18 Eq. 1).
 
-    Arguments: `coefficients` [..., (L+1)^2]; a `SphericalPolygon` or `SphericalCap`. Returns [...].
+    Arguments: `coefficients` [..., (L+1)^2]; a `SphericalPolygon` or `SphericalCap`. Returns [...], or of many polygons
+    [..., *their axes]. To each polygon its own coefficients: `jax.vmap(integrate)(coefficients, polygons)`.
     Derivatives: in all floating arguments.
     Accuracy: relative, in the median of random expansions of degree 20, 1e-13 in float64 and 2e-5 in float32.
     """
     c, degree = _checks.coefficients("coefficients", coefficients)
     _check_region(region)
+    if isinstance(region, SphericalPolygon) and c.ndim == 1:
+        return _integral(c, region, degree)
     c, basis = same_dtype(c, _coefficients(region, degree))
-    return jnp.einsum("...n,n->...", c, basis, precision="highest")
+    return jnp.tensordot(c, basis, axes=(-1, -1), precision="highest")
 
 
 def _axes(axes: ArrayLike) -> Float[Array, "k 3"]:
@@ -112,30 +118,55 @@ def _checked_axes(axes: Array) -> Array:
 
 
 @eqx.filter_jit
-def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "k l"]:
+def _zonal_moments(region: Region, axes: Array, degree: int) -> Float[Array, "*batch k l"]:
     d = _checked_axes(axes)
     if isinstance(region, SphericalCap):
         axis, d = same_dtype(region.axis, d)
         cosine = dot(d.T, axis[:, None])
         return cap_integrals(region.versine.astype(d.dtype), degree)[None] * legendre(cosine, degree)
-    v, d = same_dtype(region.loop(), d)
-    angle = jnp.broadcast_to(loop_solid_angle(v, region.largest)[None, None], (1, d.shape[0], 1))
-    rest = [moments(d, v, degree)] if degree else []
-    return jnp.concatenate([angle, *rest])[..., 0].T
+
+    def of_polygon(polygon: SphericalPolygon) -> Float[Array, "k l"]:
+        v, axes = same_dtype(polygon.loop(), d)
+        angle = jnp.broadcast_to(loop_solid_angle(v, polygon.largest)[None, None], (1, axes.shape[0], 1))
+        rest = [moments(axes, v, degree)] if degree else []
+        return jnp.concatenate([angle, *rest])[..., 0].T
+
+    return for_each(of_polygon, region)
 
 
 @eqx.filter_jit
-def _axial_moments(polygon: SphericalPolygon, axes: Array, order: int) -> Float[Array, "k n"]:
-    v, d = same_dtype(polygon.loop(), _checked_axes(axes))
-    return powers(d, v, loop_solid_angle(v, polygon.largest), order)[..., 0].T
+def _axial_moments(polygon: SphericalPolygon, axes: Array, order: int) -> Float[Array, "*batch k n"]:
+    checked = _checked_axes(axes)
+
+    def of_one(polygon: SphericalPolygon) -> Float[Array, "k n"]:
+        v, d = same_dtype(polygon.loop(), checked)
+        return powers(d, v, loop_solid_angle(v, polygon.largest), order)[..., 0].T
+
+    return for_each(of_one, polygon)
 
 
 @eqx.filter_jit
-def _coefficients(region: Region, degree: int) -> Float[Array, " n"]:
+def _coefficients(region: Region, degree: int) -> Float[Array, "*batch n"]:
     if isinstance(region, SphericalCap):
         return cap_coefficients(region.versine, region.axis, degree)
-    v = region.loop()
-    return loop_coefficients(v, loop_solid_angle(v, region.largest), degree)[:, 0]
+
+    def of_polygon(polygon: SphericalPolygon) -> Float[Array, " n"]:
+        v = polygon.loop()
+        return loop_coefficients(v, loop_solid_angle(v, polygon.largest), degree)[:, 0]
+
+    return for_each(of_polygon, region)
+
+
+@eqx.filter_jit
+def _integral(c: Float[Array, " n"], polygon: SphericalPolygon, degree: int) -> Float[Array, "*batch"]:
+    """As one sum over moments, which are not kept."""
+
+    def of_one(polygon: SphericalPolygon) -> Scalar:
+        own, v = same_dtype(c, polygon.loop())
+        constant = own[0] * math.sqrt(1 / (4 * np.pi)) * loop_solid_angle(v, polygon.largest)
+        return (constant + fold_expansion(own[:, None], v, *zonal_inverse(degree, v.dtype)))[0]
+
+    return for_each(of_one, polygon)
 
 
 def loop_coefficients(v: Loop, solid_angle: Float[Array, " p"], degree: int) -> Float[Array, "n p"]:

@@ -4,23 +4,33 @@ The layout inside is that of `moments`: v[x y z, vertex, p], one loop per point 
 vertex, since edges of no length add nothing to any integral.
 """
 
+import functools
+from collections.abc import Callable
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from shisd import _checks
+from shisd._lanes import in_lanes
 from shisd._module import Module
 from shisd._numerics import arctan2, cross, dot, normalize, same_dtype
-from shisd._typing import Array, ArrayLike, Float, Scalar
+from shisd._typing import Array, ArrayLike, Float
 from shisd.domains.moments import Loop, sides
+from shisd.domains.moments._edges import sum_first
+
+Result = TypeVar("Result")
 
 
 class SphericalPolygon(Module):
-    """A region of the sphere bounded by great arcs between unit vertices.
+    """A region of the sphere bounded by great arcs between unit vertices; with leading axes many such regions.
 
-    Arguments: `vertices` [slots, 3], unit vectors, each arc shorter than pi; `count`, how many of them are used (all,
-    unless given; it may be traced): the slots after them are padding, whatever they hold.
+    Arguments: `vertices` [..., slots, 3], unit vectors, each arc shorter than pi; `count`, how many of them are used
+    (all, unless given; it may be traced): the slots after them are padding, whatever they hold.
+    Of many polygons, the functions of `domains` give results with their leading axes, as `jax.vmap` does over polygons
+    without; both are fast.
     Orientation: positive when counter-clockwise seen from outside the sphere, the interior on the left of every edge.
     Reversed winding changes the sign of every integral. Outlines need not be convex. Where an outline crosses itself,
     each part counts as often as the outline winds around it.
@@ -35,11 +45,11 @@ class SphericalPolygon(Module):
     in space become polygons with `polygon_from_points`.
     """
 
-    vertices: Float[Array, "slots 3"]
+    vertices: Float[Array, "*batch slots 3"]
     largest: float = eqx.field(static=True)
 
     def __init__(self, vertices: ArrayLike, count: ArrayLike | None = None, *, largest: float = 2 * np.pi):
-        v = _checks.outline("vertices", vertices)
+        v = _checks.outline("vertices", vertices, many=True)
         if not isinstance(largest, float | int | np.floating) or not 0 < largest <= 4 * np.pi:
             raise ValueError(f"`largest` must be a solid angle above 0 and at most 4 pi; got {largest}.")
         self.vertices = v if count is None else _used(v, count)
@@ -47,10 +57,10 @@ class SphericalPolygon(Module):
 
     @property
     def slots(self) -> int:
-        return self.vertices.shape[0]
+        return self.vertices.shape[-2]
 
     def loop(self) -> Loop:
-        """Checked unit vertices as [3, slots, 1]."""
+        """Checked unit vertices as [3, slots, 1], of one polygon."""
         v = self.vertices.T[..., None]
         off = jnp.abs(dot(v, v) - 1)
         middle = sides(v)[1]
@@ -71,9 +81,16 @@ class SphericalPolygon(Module):
         return jax.lax.stop_gradient(value - unit) + unit
 
 
-def _used(vertices: Float[Array, "slots 3"], count: ArrayLike) -> Float[Array, "slots 3"]:
+def for_each(function: Callable[[SphericalPolygon], Result], polygon: SphericalPolygon) -> Result:
+    """function(polygon), or of many, of each: results with their leading axes."""
+    for _ in polygon.vertices.shape[:-2]:
+        function = jax.vmap(function)
+    return function(polygon)
+
+
+def _used(vertices: Float[Array, "*batch slots 3"], count: ArrayLike) -> Float[Array, "*batch slots 3"]:
     """The first `count` vertices, the other slots filled with the last of them; NaN for a traced count out of range."""
-    slots = vertices.shape[0]
+    slots = vertices.shape[-2]
     if not isinstance(count, jax.Array):
         if _checks.integer("count", count, 3) > slots:
             raise ValueError(f"`count` must be from 3 to the number of slots, {slots}; got {count}.")
@@ -81,7 +98,7 @@ def _used(vertices: Float[Array, "slots 3"], count: ArrayLike) -> Float[Array, "
         raise ValueError(f"`count` must be one integer; got {count.dtype} of shape {list(count.shape)}.")
     n = jnp.asarray(count, jnp.int32)
     last = jnp.minimum(np.arange(slots, dtype=np.int32), n - 1)
-    return jnp.where((n >= 3) & (n <= slots), vertices[last], jnp.nan)
+    return jnp.where((n >= 3) & (n <= slots), vertices[..., last, :], jnp.nan)
 
 
 def polygon_from_points(
@@ -89,20 +106,24 @@ def polygon_from_points(
 ) -> SphericalPolygon:
     """The spherical polygon that a polygon in space covers, seen from a point.
 
-    Arguments: `points` [slots, 3] and `origin` [3], in any unit of length; `count` and `largest` as in
-    `SphericalPolygon`. Counter-clockwise from outside the sphere is clockwise as seen from `origin`.
+    Arguments: `points` [..., slots, 3] and `origin` [..., 3], in any unit of length, whose leading axes broadcast;
+    `count` and `largest` as in `SphericalPolygon`. Counter-clockwise from outside the sphere is clockwise as seen from
+    `origin`.
     Derivatives: in both, undefined (NaN) where a point coincides with `origin`. Points of a plane through `origin`
     cover nothing.
     Accuracy: a difference is taken first, of NumPy arrays and lists in float64 whatever the result's dtype; how far
     both are from the origin of space thus does not matter, beyond the rounding of the coordinates that are passed.
     """
-    p, o = same_dtype(_checks.outline("points", points), _checks.vectors("origin", origin))
-    if o.shape != (3,):
-        raise ValueError(f"`origin` must have shape [3]; got {list(o.shape)}.")
+    p, o = same_dtype(_checks.outline("points", points, many=True), _checks.vectors("origin", origin))
+    try:
+        batch = np.broadcast_shapes(p.shape[:-2], o.shape[:-1])
+    except ValueError as error:
+        raise ValueError(f"`origin` {list(o.shape)} does not go with `points` {list(p.shape)}.") from error
     if isinstance(points, jax.Array) or isinstance(origin, jax.Array):
-        relative = p - o[None]
+        shape = (*batch, *p.shape[-2:])
+        relative = jnp.broadcast_to(p, shape) - jnp.broadcast_to(o[..., None, :], shape)
     else:
-        relative = jnp.asarray(np.asarray(points, float) - np.asarray(origin, float), p.dtype)
+        relative = jnp.asarray(np.asarray(points, float) - np.asarray(origin, float)[..., None, :], p.dtype)
     return SphericalPolygon(normalize(relative), count, largest=largest)
 
 
@@ -123,15 +144,20 @@ def clip_to_hemisphere(polygon: SphericalPolygon, normal: ArrayLike) -> Spherica
 
 @eqx.filter_jit
 def _clip(polygon: SphericalPolygon, normal: Float[Array, "3"]) -> SphericalPolygon:
-    v, n = same_dtype(polygon.loop(), normalize(normal))
+    n = normalize(normal)
     n = eqx.error_if(n, ~jnp.all(jnp.isfinite(n)), "`normal` is zero or not finite.")
-    clipped = on_sphere(clip(v, dot(v, n[:, None, None])))
-    return SphericalPolygon(clipped[..., 0].T, largest=polygon.largest)
+
+    def of_one(polygon: SphericalPolygon) -> Float[Array, "slots 3"]:
+        v, axis = same_dtype(polygon.loop(), n)
+        return on_sphere(clip(v, dot(v, axis[:, None, None])))[..., 0].T
+
+    return SphericalPolygon(for_each(of_one, polygon), largest=polygon.largest)
 
 
-def solid_angle(polygon: SphericalPolygon) -> Scalar:
+def solid_angle(polygon: SphericalPolygon) -> Float[Array, "*batch"]:
     """Solid angle of a polygon in sr, positive for counter-clockwise winding, in (largest - 4 pi, largest].
 
+    Returns [...] of many polygons.
     Derivatives: in the vertices. Accuracy: relative 4e-7 in float32, of the vertices as they are, down to 2e-12 sr and
     to edges 1e-5 rad short of pi (6e-4 for slivers 5e-5 rad wide); in float64 1e-12 down to 1e-6 sr, and below that
     what 1e-16 rad of the vertices makes.
@@ -141,8 +167,8 @@ def solid_angle(polygon: SphericalPolygon) -> Scalar:
 
 
 @eqx.filter_jit
-def _solid_angle(polygon: SphericalPolygon) -> Scalar:
-    return loop_solid_angle(polygon.loop(), polygon.largest)[0]
+def _solid_angle(polygon: SphericalPolygon) -> Float[Array, "*batch"]:
+    return for_each(lambda one: loop_solid_angle(one.loop(), one.largest)[0], polygon)
 
 
 def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | None = None) -> Float[Array, " p"]:
@@ -151,19 +177,23 @@ def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | No
     The fan starts at the first vertex, or where another is nearly opposite, at `fallback`: where it is given, it is a
     direction that no vertex is more than a quarter turn away from, and the fan adds up to what is meant.
     """
+    return in_lanes(functools.partial(_fan, largest=largest), (v,) if fallback is None else (v, fallback))
+
+
+def _fan(v: Loop, fallback: Float[Array, "3 p"] | None = None, *, largest: float) -> Float[Array, " p"]:
     first = jax.lax.stop_gradient(v[:, 0])
-    risky = jnp.min(dot(v, first[:, None]), axis=0) < -0.9
+    risky = functools.reduce(jnp.minimum, list(dot(v, first[:, None]))) < -0.9
     other = _far_from_opposites(jax.lax.stop_gradient(v)) if fallback is None else jax.lax.stop_gradient(fallback)
     apex = jnp.where(risky[None], other, first)[:, None]
     chord, middle = sides(v)
     short = dot(chord, chord) < dot(middle, middle)
     across = dot(apex - v, cross(v, jnp.where(short[None], chord, middle)))
     along = dot(middle, apex + 0.5 * middle)
-    angle = 2 * jnp.sum(arctan2(across, along), axis=0)
+    angle = 2 * sum_first(arctan2(across, along))
     if fallback is not None:
         return angle
     # Both ends of the range are one outline, and rounding decides between them: a hemisphere is 2 pi, nothing is 0.
-    size = jnp.sum(jnp.sqrt(dot(apex - v, apex - v) * dot(chord, chord)), axis=0)
+    size = sum_first(jnp.sqrt(dot(apex - v, apex - v) * dot(chord, chord)))
     rounding = 16 * jnp.finfo(v.dtype).eps * size
     from_lowest = angle - (largest - 4 * np.pi) + (rounding if largest > 2 * np.pi else -rounding)
     turns = jnp.floor(jax.lax.stop_gradient(from_lowest) / (4 * np.pi))
@@ -174,14 +204,19 @@ def _far_from_opposites(v: Loop) -> Float[Array, "3 p"]:
     """Of the 14 directions to the faces and corners of a cube, the one that is farthest from opposite to a vertex."""
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3) / np.sqrt(3)
-    candidates = jnp.asarray(np.concatenate([faces, corners]), v.dtype)
-    nearest = jnp.min(jnp.einsum("ci,isp->csp", candidates, v), axis=1)
-    return candidates[jnp.argmax(nearest, axis=0)].T
+    best, found = jnp.full(v.shape[2:], -jnp.inf, v.dtype), jnp.zeros_like(v[:, 0])
+    for candidate in jnp.asarray(np.concatenate([faces, corners]), v.dtype):
+        nearest = functools.reduce(jnp.minimum, list(dot(candidate, v)))
+        better = nearest > best
+        best = jnp.where(better, nearest, best)
+        found = jnp.where(better[None], candidate[:, None], found)
+    return found
 
 
 def on_sphere(points: Loop) -> Loop:
     """Loops of points of any length as unit vertices: `normalize` written out, whose sums over this axis are slower."""
-    scaled = points / jax.lax.stop_gradient(jnp.max(jnp.abs(points), axis=0))[None]
+    largest = functools.reduce(jnp.maximum, list(jnp.abs(points)))
+    scaled = points / jax.lax.stop_gradient(largest)[None]
     return scaled / jnp.sqrt(dot(scaled, scaled))[None]
 
 

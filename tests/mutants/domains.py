@@ -10,7 +10,7 @@ _CASE = "tests/domains/test_moments.py::test_values_and_derivatives"
 MUTANTS = [
     Mutant(
         "no gradient of moments in the outline", _DERIVATIVES,
-        old="return -jax.lax.scan(step, terms.start()", new="return 0 * jax.lax.scan(step, terms.start()",
+        old="return -jnp.sum(start[None] * a", new="return 0 * jnp.sum(start[None] * a",
         test=f"{_CASE}[non-convex]",
     ),
     Mutant(
@@ -22,6 +22,16 @@ MUTANTS = [
         "no gradient of sums of moments in the outline", _FOLD,
         old="change -= sum_first(speed * weight)", new="change -= sum_first(0 * speed * weight)",
         test="tests/domains/test_moments.py::test_fold_agrees_with_moments",
+    ),
+    Mutant(
+        "the last points in lanes twice", "shisd/_lanes.py",
+        old="all, own, i * LANES, -1)", new="all, own, 0 * i * LANES, -1)",
+        test="tests/test_lanes.py::test_any_number_of_points[one kernel-float32-129]",
+    ),
+    Mutant(
+        "points that have no batch with the wrong ones of a batch", "shisd/_lanes.py",
+        old="jnp.moveaxis(a, 0, -2) if has_batch else", new="jnp.moveaxis(a, 0, -1) if has_batch else",
+        test="tests/test_lanes.py::test_batches_of_vmap_are_points[plain]",
     ),
     Mutant(
         "edges that the horizon adds are left out", _FOLD,
@@ -87,7 +97,7 @@ MUTANTS = [
     ),
     Mutant(
         "a traced count below 3", _POLYGON,
-        old="jnp.where((n >= 3) & (n <= slots), vertices[last], jnp.nan)", new="vertices[last]",
+        old="jnp.where((n >= 3) & (n <= slots), vertices[..., last, :], jnp.nan)", new="vertices[last]",
         test="tests/domains/test_polygon.py::test_padding_and_traced_counts",
     ),
     Mutant(

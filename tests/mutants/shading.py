@@ -42,7 +42,7 @@ MUTANTS = [
     ),
     Mutant(
         "no clip at the horizon", "shisd/shading/paths/_polygon.py",
-        old="whole, lambda: clip(outline, above))", new="whole, whole)", test=SLICE,
+        old="whole, lambda: in_lanes(clip, (outline, above)))", new="whole, whole)", test=SLICE,
     ),
     Mutant(
         "a light's plane from absolute coordinates", OUTLINE,

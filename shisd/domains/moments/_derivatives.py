@@ -12,16 +12,17 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from shisd._lanes import in_lanes
 from shisd._numerics import dot
 from shisd._typing import Array, Float
-from shisd.domains.moments._edges import Loop, Spans, spans_of, sum_first, unpack
+from shisd.domains.moments._edges import Loop, Spans, spans_of, unpack
 from shisd.domains.moments._recurrence import Factors, factors_of, sweep
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def moments(axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, "l k p"]:
     """I_l(axes[k]) for l = 1 ... degree."""
-    return sweep(axes, v, degree)
+    return in_lanes(functools.partial(sweep, degree=degree), (v,), (axes,))
 
 
 def _moments_jvp(degree, primals, tangents):
@@ -30,7 +31,7 @@ def _moments_jvp(degree, primals, tangents):
     if isinstance(d_axes, SymbolicZero):
         values = moments(axes, v, degree)
     else:  # of differences, like the values: the lines that the vertices turn along would lose a factor of the size
-        values, change = jax.jvp(lambda a: sweep(a, v, degree), (axes,), (d_axes,))
+        values, change = jax.jvp(lambda a: sweep(v, a, degree), (axes,), (d_axes,))
     if not isinstance(dv, SymbolicZero):
         moved = _moved(axes, v, dv, degree)
         change = moved if change is None else change + moved
@@ -39,17 +40,21 @@ def _moments_jvp(degree, primals, tangents):
 
 def _moved(axes: Float[Array, "k 3"], v: Loop, dv: Loop, degree: int) -> Float[Array, "l k p"]:
     """Changes of the moments with the vertices."""
-    packed = spans_of(v)
-    start, end = (x[:, None] for x in speeds(unpack(Spans, packed), dv))
-    spans = unpack(Spans, packed[:, :, None])
+    start, end = (x[:, None] for x in speeds(unpack(Spans, spans_of(v)), dv))
+    a, b = in_lanes(functools.partial(_at_vertices, degree=degree), (v,), (axes,))
+    return -jnp.sum(start[None] * a + end[None] * b, axis=1)
+
+
+def _at_vertices(v: Loop, axes: Float[Array, "k 3"], degree: int) -> tuple[Array, Array]:
+    """The integrals of `at_vertices` for l = 1 ... degree, [l, e, k, p] each."""
+    spans = unpack(Spans, spans_of(v)[:, :, None])
     terms = boundary(spans, axes.T[:, None, :, None])
 
-    def step(state: _BoundaryState, n: Factors) -> tuple[_BoundaryState, Array]:
+    def step(state: _BoundaryState, n: Factors) -> tuple[_BoundaryState, tuple[Array, Array]]:
         state = terms.advance(state, n)
-        a, b = at_vertices(spans, state.middle, state.chord)
-        return state, sum_first(start * a + end * b)
+        return state, at_vertices(spans, state.middle, state.chord)
 
-    return -jax.lax.scan(step, terms.start(), factors_of(1, degree, v.dtype))[1]
+    return jax.lax.scan(step, terms.start(), factors_of(1, degree, v.dtype))[1]
 
 
 moments.defjvp(_moments_jvp, symbolic_zeros=True)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from shisd._lanes import in_lanes
 from shisd._numerics import dot
 from shisd._typing import Array, Float
 from shisd.domains.moments._derivatives import at_vertices, boundary, moments, speeds
@@ -43,6 +44,10 @@ def _by_degree(weights: Float[Array, "k l q"]) -> Float[Array, "bands k q"]:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def _fold(weights: Array, axes: Array, v: Loop, degree: int, spare: int) -> Float[Array, " p"]:
+    return in_lanes(functools.partial(_fold_loops, degree=degree, spare=spare), (weights, v), (axes,))
+
+
+def _fold_loops(weights: Array, v: Loop, axes: Array, degree: int, spare: int) -> Float[Array, " p"]:
     arcs = arcs_of(v)
     return _fold_edges(weights, axes, arcs.c, arcs.total, arcs.edges, degree, spare)
 
@@ -109,14 +114,17 @@ def _fold_jvp(degree, spare, primals, tangents):
         turned = jax.jvp(lambda a: moments(a, v, degree), (axes,), (d_axes,))[1]
         change += _sum_all(turned * _by_degree(weights))
     if not isinstance(dv, SymbolicZero):
-        spans = spans_of(v)
-        weights_of_ends = _fold_boundary(weights, axes, spans, degree)
-        for speed, weight in zip(speeds(unpack(Spans, spans), dv), weights_of_ends, strict=True):
+        weights_of_ends = in_lanes(functools.partial(_fold_boundaries, degree=degree), (weights, v), (axes,))
+        for speed, weight in zip(speeds(unpack(Spans, spans_of(v)), dv), weights_of_ends, strict=True):
             change -= sum_first(speed * weight)
     return value, change
 
 
 _fold.defjvp(_fold_jvp, symbolic_zeros=True)
+
+
+def _fold_boundaries(weights: Array, v: Loop, axes: Array, degree: int) -> tuple[Array, Array]:
+    return _fold_boundary(weights, axes, spans_of(v), degree)
 
 
 @functools.partial(jax.jit, static_argnames="degree")

@@ -172,7 +172,7 @@ def _all_edges(arcs: Arcs, axes: Float[Array, "k 3"]) -> tuple[Array, _Reference
     return dot(arcs.total[:, None], d[:, 0]), c, edges, _zonal(edges, d, c, *ends)
 
 
-def sweep(axes: Float[Array, "k 3"], v: Loop, degree: int) -> Float[Array, "l k p"]:
+def sweep(v: Loop, axes: Float[Array, "k 3"], degree: int) -> Float[Array, "l k p"]:
     total, c, _, x = _all_edges(arcs_of(v), axes)
     first = 0.5 * total
     if degree == 1:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import _checks
+from shisd._lanes import in_lanes
 from shisd._numerics import dot, times
 from shisd._typing import Array, Float
 from shisd.domains.internal import (
@@ -39,7 +40,7 @@ from shisd.shading.paths._path import local_path
 from shisd.shading.slices._slices import Slices, lookup_factors, lookup_table, slice_values
 
 Light = PolygonLight | PortalLight
-_TILE = 2048  # pixels at a time
+_TILE = 256  # pixels at a time
 SMALL_TILE = 128  # where every pixel holds the moments about all axes
 Y_00 = math.sqrt(1 / (4 * math.pi))
 
@@ -86,7 +87,7 @@ def _uniform(slices: Slices, table: Array, local: Array, outline: Loop, above: A
     def integrals() -> Float[Array, "*colour p"]:
         whole = lambda: jnp.concatenate([outline, *[outline[:, :1]] * spare], axis=1)
         all_whole = jnp.all((jnp.min(above, axis=0) > 0) | dark)
-        v = on_sphere(jax.lax.cond(all_whole, whole, lambda: clip(outline, above)))
+        v = in_lanes(on_sphere, (jax.lax.cond(all_whole, whole, lambda: in_lanes(clip, (outline, above))),))
         angle = loop_solid_angle(v, 2 * np.pi, _up(v))
         if slices.isotropic:
             constant, of_colours = table[..., 0, :] @ lookup_factors(local, slices), table
