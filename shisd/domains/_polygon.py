@@ -204,13 +204,14 @@ def _far_from_opposites(v: Loop) -> Float[Array, "3 p"]:
     """Of the 14 directions to the faces and corners of a cube, the one that is farthest from opposite to a vertex."""
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3) / np.sqrt(3)
-    best, found = jnp.full(v.shape[2:], -jnp.inf, v.dtype), jnp.zeros_like(v[:, 0])
-    for candidate in jnp.asarray(np.concatenate([faces, corners]), v.dtype):
+
+    def step(best: tuple[Array, Array], candidate: Float[Array, "3"]) -> tuple[tuple[Array, Array], None]:
         nearest = functools.reduce(jnp.minimum, list(dot(candidate, v)))
-        better = nearest > best
-        best = jnp.where(better, nearest, best)
-        found = jnp.where(better[None], candidate[:, None], found)
-    return found
+        better = nearest > best[0]
+        return (jnp.where(better, nearest, best[0]), jnp.where(better[None], candidate[:, None], best[1])), None
+
+    worst = jnp.full(v.shape[2:], -jnp.inf, v.dtype), jnp.zeros_like(v[:, 0])
+    return jax.lax.scan(step, worst, jnp.asarray(np.concatenate([faces, corners]), v.dtype))[0][1]
 
 
 def on_sphere(points: Loop) -> Loop:

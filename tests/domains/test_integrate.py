@@ -91,31 +91,46 @@ def test_gradients(x64, rng):
     check_grads(cap, (unit([1.0, 2.0, 0.3]), np.asarray(0.7)), 1, rtol=1e-6, atol=1e-8)
 
 
-def test_many_polygons_by_leading_axes_and_by_vmap(rng):
-    """More than fit into the lanes of one kernel."""
+@pytest.fixture
+def many(rng):
+    """More polygons than fit into the lanes of one kernel, their coefficients to degree 4, and an expansion."""
     v = np.stack([padded(random_polygon(rng, 4, s)) for s in rng.uniform(0.1, 1, 150)]).astype(np.float32)
-    c, own = rng.normal(size=(3, 25)).astype(np.float32), rng.normal(size=(150, 25)).astype(np.float32)
     expected = np.stack([truth.edge_coefficients(x[:4], 4) for x in v]).astype(float)
-    many = domains.SphericalPolygon(v.reshape(50, 3, *v.shape[1:]))
-    near = functools.partial(np.testing.assert_allclose, atol=2e-5, rtol=0)
-    near(domains.polygon_coefficients(many, 4).reshape(150, 25), expected)
-    near(domains.integrate(c[0], many).reshape(150), expected @ c[0])
-    near(domains.integrate(c, many).reshape(3, 150), c @ expected.T)
+    return v, expected, rng.normal(size=25).astype(np.float32)
+
+
+near = functools.partial(np.testing.assert_allclose, atol=2e-5, rtol=0)
+
+
+def test_one_expansion_over_many_polygons(many):
+    v, expected, c = many
+    near(domains.integrate(c, domains.SphericalPolygon(v.reshape(50, 3, *v.shape[1:]))).reshape(150), expected @ c)
+    one = lambda v: domains.integrate(c, domains.SphericalPolygon(v))
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(one)))(v)
+    near(values, expected @ c)
+    near(slopes[0], jax.grad(one)(v[0]))
+
+
+@pytest.mark.slow
+def test_many_polygons_by_leading_axes_and_by_vmap(many, rng):
+    v, expected, _ = many
+    c, own = rng.normal(size=(3, 25)).astype(np.float32), rng.normal(size=(150, 25)).astype(np.float32)
+    polygons = domains.SphericalPolygon(v.reshape(50, 3, *v.shape[1:]))
+    near(domains.polygon_coefficients(polygons, 4).reshape(150, 25), expected)
+    near(domains.integrate(c, polygons).reshape(3, 150), c @ expected.T)
     one = lambda c, v: domains.integrate(c, domains.SphericalPolygon(v))
     near(jax.jit(jax.vmap(one))(own, v), np.sum(expected * own, axis=1))
     coefficients = jax.vmap(lambda v: domains.polygon_coefficients(domains.SphericalPolygon(v), 4))
     near(jax.jit(coefficients)(v), expected)
-    slopes = jax.jit(jax.grad(lambda v: jnp.sum(domains.integrate(c[0], domains.SphericalPolygon(v)))))(v)
-    near(slopes[:3], [jax.grad(one, 1)(c[0], x) for x in v[:3]])
     axes = unit(rng.normal(size=(2, 3))).astype(np.float32)
     for function in (domains.zonal_moments, domains.axial_moments):
-        got = function(many, axes, 2)
+        got = function(polygons, axes, 2)
         assert got.shape == (50, 3, 2, 3)
         near(got[7, 1], function(domains.SphericalPolygon(v[22]), axes, 2))
     angles = np.sqrt(4 * np.pi) * expected[:, 0]
-    near(domains.solid_angle(many).reshape(150), angles)
-    cut = domains.clip_to_hemisphere(many, axes[0])
-    assert cut.vertices.shape == (50, 3, 3 * many.slots // 2, 3)
+    near(domains.solid_angle(polygons).reshape(150), angles)
+    cut = domains.clip_to_hemisphere(polygons, axes[0])
+    assert cut.vertices.shape == (50, 3, 3 * polygons.slots // 2, 3)
     near(cut.vertices[7, 1], domains.clip_to_hemisphere(domains.SphericalPolygon(v[22]), axes[0]).vertices)
     seen = domains.polygon_from_points(3 * v[:, :4], np.zeros(3, np.float32))
     near(domains.solid_angle(seen), angles)
