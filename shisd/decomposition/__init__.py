@@ -20,3 +20,5 @@ from shisd.decomposition._kernels import PhongKernel as PhongKernel
 from shisd.decomposition._mixtures import GaussianLobes as GaussianLobes
 from shisd.decomposition._mixtures import ZonalLobes as ZonalLobes
 from shisd.decomposition._sparse import sparse_weights as sparse_weights
+from shisd.decomposition._transformed import TransformedExpansion as TransformedExpansion
+from shisd.decomposition._transformed import fit_transformed as fit_transformed

@@ -19,3 +19,5 @@ from shisd.shading._surface import Surface as Surface
 from shisd.shading.paths._occluded import visibility_gamma as visibility_gamma
 from shisd.shading.slices._slices import Slices as Slices
 from shisd.shading.slices._tabulate import tabulate_brdf as tabulate_brdf
+from shisd.shading.slices._transformed import TransformedSlices as TransformedSlices
+from shisd.shading.slices._transformed import transform_brdf as transform_brdf

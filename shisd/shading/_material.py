@@ -1,5 +1,7 @@
 """Materials made ready: a form of their slices for light from all around, and one for light above the horizon."""
 
+import numpy as np
+
 from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress
@@ -7,6 +9,7 @@ from shisd.models import AbstractBrdf
 from shisd.shading._matrix import BrdfMatrix
 from shisd.shading.slices._slices import Slices
 from shisd.shading.slices._tabulate import table
+from shisd.shading.slices._transformed import TransformedSlices, transform_brdf
 from shisd.shading.slices._upper import RIDGE
 
 
@@ -14,22 +17,48 @@ class Material(Module):
     """A material as `shade` takes it.
 
     `distant`: slices that stand for it everywhere, or its matrix, for light from all around; `local`: slices for light
-    that is cut off at the horizon, best fitted above it. `None` where there is no such light.
+    that is cut off at the horizon, best fitted above it; `lamps`: slices beyond maps of directions, which take their
+    place under polygons that shine alike in all directions. `None` where there is no such light.
     """
 
     distant: Slices | BrdfMatrix | None
     local: Slices | None
+    lamps: TransformedSlices | None
 
-    def __init__(self, distant: Slices | BrdfMatrix | None = None, local: Slices | None = None):
-        if distant is None and local is None:
-            raise ValueError("a material needs `distant` or `local` slices; got neither.")
+    def __init__(
+        self,
+        distant: Slices | BrdfMatrix | None = None,
+        local: Slices | None = None,
+        lamps: TransformedSlices | None = None,
+    ):
+        if distant is None and local is None and lamps is None:
+            raise ValueError("a material needs `distant`, `local` or `lamps` slices; got none.")
         if not isinstance(distant, Slices | BrdfMatrix | None):
             raise ValueError(f"`distant` must be shading.Slices or BrdfMatrix; got {type(distant).__name__}.")
         if distant is not None and distant.domain != "sphere":
             raise ValueError("`distant` was fitted above the horizon only; make it with domain='sphere'.")
         if not isinstance(local, Slices | None):
             raise ValueError(f"`local` must be shading.Slices; got {type(local).__name__}.")
-        self.distant, self.local = distant, local
+        if not isinstance(lamps, TransformedSlices | None):
+            raise ValueError(f"`lamps` must be shading.TransformedSlices; got {type(lamps).__name__}.")
+        if local is not None and lamps is not None and local.isotropic != lamps.isotropic:
+            raise ValueError("`local` and `lamps` are of an isotropic and an anisotropic material: make both of one.")
+        self.distant, self.local, self.lamps = distant, local, lamps
+
+
+class LocalForms(Module):
+    """The slices of a material above the horizon."""
+
+    plain: Slices | None
+    lamps: TransformedSlices | None
+
+    @property
+    def isotropic(self) -> bool:
+        return (self.plain or self.lamps).isotropic  # type: ignore[union-attr]  # one is there
+
+    @property
+    def colour(self) -> tuple[int, ...]:
+        return np.broadcast_shapes(*(form.colour for form in (self.plain, self.lamps) if form is not None))
 
 
 def prepare(
@@ -37,6 +66,7 @@ def prepare(
     degree: int,
     *,
     local_degree: int | None = None,
+    lamp_degree: int | None = None,
     elevations: int = 64,
     azimuths: int | None = None,
     quadrature: int | None = None,
@@ -47,7 +77,9 @@ def prepare(
     """A material made ready for every kind of light: slices by view for distant light, and fitted for local light.
 
     Arguments: `brdf`; static `degree` for distant light and balls, `local_degree` for polygons and portals, by default
-    the same; the others as in `tabulate_brdf`, which integrates the material once, to the higher degree.
+    the same; `lamp_degree`, none unless given, that of expansions beyond maps of directions (`transform_brdf`) for
+    polygons, of which 4 or 8 are enough for sharp materials; the others as in `tabulate_brdf`, which integrates the
+    material once, to the higher degree.
     Derivatives: in every parameter of the material, both modes. The result has the dtype of these.
     Accuracy and cost: `tabulate_brdf`.
     """
@@ -55,7 +87,8 @@ def prepare(
     local_degree = degree if local_degree is None else _checks.integer("local_degree", local_degree)
     most = max(degree, local_degree)
     slices = table(brdf, most, (None, RIDGE), elevations, azimuths, quadrature, tolerance, throw, progress)
-    return Material(slices.cut(degree), slices.cut(local_degree).above_horizon())
+    lamps = None if lamp_degree is None else transform_brdf(brdf, lamp_degree)
+    return Material(slices.cut(degree), slices.cut(local_degree).above_horizon(), lamps)
 
 
 def as_material(material: object) -> Material:
@@ -67,6 +100,8 @@ def as_material(material: object) -> Material:
             return Material(material, material)
         case Slices():
             return Material(None, material)
+        case TransformedSlices():
+            return Material(None, None, material)
         case BrdfMatrix(domain="sphere"):
             return Material(material)
         case BrdfMatrix():
@@ -76,7 +111,9 @@ def as_material(material: object) -> Material:
             )
     hint = " Make it ready by shading.prepare." if isinstance(material, AbstractBrdf) else ""
     came = type(material).__name__
-    raise ValueError(f"`material` must come from shading.prepare, tabulate_brdf or project_brdf; got {came}.{hint}")
+    raise ValueError(
+        f"`material` must come from shading.prepare, tabulate_brdf, transform_brdf or project_brdf; got {came}.{hint}"
+    )
 
 
 def slices_everywhere(material: Material, light: str) -> Slices:
@@ -98,9 +135,9 @@ def distant_form(material: Material, light: str) -> Slices | BrdfMatrix:
     return material.distant
 
 
-def local_form(material: Material, light: str) -> Slices:
-    if material.local is None:
+def local_forms(material: Material, light: str) -> LocalForms:
+    if material.local is None and material.lamps is None:
         raise ValueError(
             f"`material` has no slices for a {light}: pass shading.prepare(brdf, degree), or `slices()` of a matrix."
         )
-    return material.local
+    return LocalForms(material.local, material.lamps)

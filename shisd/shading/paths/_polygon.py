@@ -11,6 +11,7 @@ only they are turned to the local frame.
 """
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -34,10 +35,12 @@ from shisd.harmonics.internal import product_matrices, rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models.internal import facing
 from shisd.shading._incidence import incidence_integrals
-from shisd.shading._material import local_form
+from shisd.shading._material import LocalForms, local_forms
 from shisd.shading._tiles import shade_tiles, stacked, sum_lights
+from shisd.shading._transformed_integrals import integrals, tables_of
 from shisd.shading.paths._path import local_path
 from shisd.shading.slices._slices import Slices, lookup_factors, lookup_table, slice_values
+from shisd.shading.slices._transformed import dense_views
 
 Light = PolygonLight | PortalLight
 _TILE = 256  # pixels at a time
@@ -47,16 +50,18 @@ Y_00 = math.sqrt(1 / (4 * math.pi))
 
 @eqx.filter_jit
 def _shade(
-    points: dict[str, Float[Array, "p 3"]], slices: Slices, lights: list[Light], colour: tuple[int, ...]
+    points: dict[str, Float[Array, "p 3"]], forms: LocalForms, lights: list[Light], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    table = lookup_table(slices)
+    slices, lamps = forms.plain, forms.lamps
+    table = None if slices is None else lookup_table(slices)
+    tables = None if lamps is None else tables_of(lamps)
     kinds = stacked(lights)
-    stacks = [(stack, _products(stack, slices.degree)) for stack in kinds]
+    stacks = [(stack, _products(stack, slices)) for stack in kinds]
 
     def of_tile(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
     ) -> Float[Array, "*colour p"]:
-        zero = jnp.zeros((*colour, positions.shape[0]), table.dtype)
+        zero = jnp.zeros((*colour, positions.shape[0]), positions.dtype)
 
         def of_light(one: tuple[Light, Array | None]) -> Float[Array, "*colour p"]:
             light, product = one
@@ -64,8 +69,14 @@ def _shade(
             above = dot(frame[:, :, 2].T[:, None], relative)
             sign = jnp.where(jnp.max(above, axis=0) > 0, facing(light, relative), 0)
             outline = _in_frame(frame, relative)
-            if product is None:
-                lit = times(_uniform(slices, table, local, outline, above, sign), light.incident() * Y_00)
+            if product is None and tables is not None:
+                of_lamps = lambda v, spare: integrals(lamps, tables, dense_views(local), v, spare)
+                lit = _above_horizon(of_lamps, lamps.colour, outline, above, sign)
+                lit = times(lit, light.incident() * Y_00)
+            elif product is None:
+                of_slices = lambda v, spare: _uniform(slices, table, local, v, spare)
+                lit = _above_horizon(of_slices, slices.colour, outline, above, sign)
+                lit = times(lit, light.incident() * Y_00)
             else:
                 lit = _directional(slices, table, frame, local, outline, product)
             return jnp.broadcast_to(times(lit, sign), zero.shape)
@@ -73,35 +84,42 @@ def _shade(
         return sum_lights(of_light, stacks, zero)
 
     size = _TILE if all(product is None for _, product in stacks) else SMALL_TILE
-    return shade_tiles(slices, points, colour, size, of_tile, kinds)
+    return shade_tiles(forms, points, colour, size, of_tile, kinds)
 
 
-PATH = local_path(local_form, _shade)
+PATH = local_path(local_forms, _shade)
 
 
-def _uniform(slices: Slices, table: Array, local: Array, outline: Loop, above: Array, sign: Array) -> Array:
-    """Integrals of slices over the outline above the horizon, [*colour, p]."""
+def _above_horizon(
+    integrals: Callable[[Loop, int], Array], colour: tuple[int, ...], outline: Loop, above: Array, sign: Array
+) -> Float[Array, "*colour p"]:
+    """`integrals(v, spare)` over outlines cut off at the horizon, whose last `spare` edges seldom have a length."""
     dark = sign == 0
     spare = outline.shape[1] // 2  # edges, unless the horizon cuts an outline of this tile
 
-    def integrals() -> Float[Array, "*colour p"]:
+    def lit() -> Float[Array, "*colour p"]:
         whole = lambda: jnp.concatenate([outline, *[outline[:, :1]] * spare], axis=1)
         all_whole = jnp.all((jnp.min(above, axis=0) > 0) | dark)
-        v = in_lanes(on_sphere, (jax.lax.cond(all_whole, whole, lambda: in_lanes(clip, (outline, above))),))
-        angle = loop_solid_angle(v, 2 * np.pi, _up(v))
-        if slices.isotropic:
-            constant, of_colours = table[..., 0, :] @ lookup_factors(local, slices), table
-            of_one = lambda t: incidence_integrals(t, local, v, slices.degree, spare)
-        else:
-            of_colours = slice_values(table, local, slices)
-            constant, inverse = of_colours[..., 0, :], zonal_inverse(slices.degree, table.dtype)
-            of_one = lambda c: fold_expansion(c, v, *inverse, spare)
-        # colours in a loop: compiled code would grow with their number
-        rest = jax.lax.map(of_one, of_colours) if slices.colour else of_one(of_colours)
-        return times(constant, angle * Y_00) + rest
+        cut = jax.lax.cond(all_whole, whole, lambda: in_lanes(clip, (outline, above)))
+        return integrals(in_lanes(on_sphere, (cut,)), spare)
 
-    nothing = lambda: jnp.zeros((*slices.colour, len(local)), table.dtype)
-    return jax.lax.cond(jnp.all(dark), nothing, integrals)
+    nothing = lambda: jnp.zeros((*colour, outline.shape[2]), outline.dtype)
+    return jax.lax.cond(jnp.all(dark), nothing, lit)
+
+
+def _uniform(slices: Slices, table: Array, local: Array, v: Loop, spare: int) -> Float[Array, "*colour p"]:
+    """Integrals of slices."""
+    angle = loop_solid_angle(v, 2 * np.pi, _up(v))
+    if slices.isotropic:
+        constant, of_colours = table[..., 0, :] @ lookup_factors(local, slices), table
+        of_one = lambda t: incidence_integrals(t, local, v, slices.degree, spare)
+    else:
+        of_colours = slice_values(table, local, slices)
+        constant, inverse = of_colours[..., 0, :], zonal_inverse(slices.degree, table.dtype)
+        of_one = lambda c: fold_expansion(c, v, *inverse, spare)
+    # colours in a loop: compiled code would grow with their number
+    rest = jax.lax.map(of_one, of_colours) if slices.colour else of_one(of_colours)
+    return times(constant, angle * Y_00) + rest
 
 
 def _directional(
@@ -126,8 +144,16 @@ def _in_frame(frame: Float[Array, "p 3 3"], v: Loop) -> Loop:
     return jnp.stack([dot(axis[:, None], v) for axis in jnp.moveaxis(frame, 0, -1).swapaxes(0, 1)])
 
 
-def _products(stack: Light, degree: int) -> Float[Array, " lights *colour_n_m"] | None:
-    return jax.lax.map(lambda light: product_of(light, degree), stack)
+def _products(stack: Light, slices: Slices | None) -> Float[Array, " lights *colour_n_m"] | None:
+    """Matrices of the products with slices; None where light is constant."""
+    if slices is None:
+        if stack.incident().shape[-1] > 1:
+            raise ValueError(
+                f"`material` has only slices beyond maps, which do not go with a {type(stack).__name__} whose light "
+                "depends on direction: pass shading.prepare(brdf, degree)."
+            )
+        return None
+    return jax.lax.map(lambda light: product_of(light, slices.degree), stack)
 
 
 def product_of(light: Light, degree: int) -> Float[Array, "*colour_n_m"] | None:

@@ -1,0 +1,175 @@
+"""Integrals over polygons of slices beyond maps of directions.
+
+Great arcs stay great arcs beyond a linear map, so the outline, cut off at the horizon, is mapped and the expansion is
+integrated over it as ever; the base over the outline as it is. Slices of isotropic materials and their maps are even
+across the plane of view and normal, where everything is done (`_incidence`).
+
+A view along the normal has no such plane. There the derivative across it is that of views next to it: a difference of
+both sides, which leaves an error of the square of the angle.
+
+notation: theta = elevation of the view where tables are looked up, s = sin(theta); A = the map; u = an outline in the
+frame given, v = in that of the plane, x, y, z with z the normal.
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+
+from shisd._lanes import in_lanes
+from shisd._numerics import dot
+from shisd._typing import Array, Float
+from shisd.decomposition.internal import stretch
+from shisd.domains.internal import Loop, fold_expansion, incidence_inverse, loop_solid_angle, on_sphere, zonal_inverse
+from shisd.harmonics.internal import orders
+from shisd.shading import _views
+from shisd.shading._incidence import _turned as turned
+from shisd.shading.slices._slices import lookup_table, slice_values
+from shisd.shading.slices._transformed import BASE, TransformedSlices
+
+_STEEP = 1e-3  # s up to which the plane turns too fast
+Y_00 = math.sqrt(1 / (4 * math.pi))
+
+
+class Tables(NamedTuple):
+    """What is looked up: rows of maps [rows, columns], of expansions and bases [colours, rows, columns]."""
+
+    maps: Array
+    lobes: Array
+    base: Array
+
+
+def tables_of(slices: TransformedSlices) -> Tables:
+    maps, lobes, base = (lookup_table(part) for part in slices.parts())
+    of_colours = lambda table: table.reshape(-1, *table.shape[-2:])
+    if not slices.isotropic:
+        return Tables(maps, of_colours(lobes), of_colours(base))
+    even = lambda table: table[..., orders(math.isqrt(table.shape[-2]) - 1) >= 0, :]
+    return Tables(even(maps), even(of_colours(lobes)), even(of_colours(base)))
+
+
+def integrals(
+    slices: TransformedSlices, tables: Tables, view: Float[Array, "p 3"], u: Loop, spare: int
+) -> Float[Array, "*colour p"]:
+    """Integrals towards views, as the tables have them, over outlines above the horizon.
+
+    The last `spare` edges seldom have a length. Derivatives: the first in all, exact for every view; those in the view
+    along the sphere.
+    """
+    if slices.isotropic:
+        values = _even_integrals(tables, view, u, slices.degree, spare)
+    else:
+        maps, lobes, base = (
+            slice_values(table, view, part) for table, part in zip(tables, slices.parts(), strict=True)
+        )
+        values = _of_map(maps[-5:], lobes, base, u, slices.degree, spare, even=False)
+    return values.reshape(*slices.colour, -1)
+
+
+def _of_map(
+    s: Float[Array, "5 p"],
+    lobes: Float[Array, "c rows p"],
+    base: Float[Array, "c rows p"],
+    v: Loop,
+    degree: int,
+    spare: int,
+    *,
+    even: bool,
+) -> Float[Array, "c p"]:
+    inverse = incidence_inverse if even else zonal_inverse
+    mapped, up = in_lanes(functools.partial(_mapped, even=even), (s, v))
+    normal = jnp.broadcast_to(jnp.asarray([0, 0, 1], v.dtype)[:, None], up.shape)
+    wide, plain = loop_solid_angle(mapped, 2 * np.pi, up), loop_solid_angle(v, 2 * np.pi, normal)
+
+    def of_colour(rows: tuple[Array, Array]) -> Float[Array, " p"]:
+        lobe, under = rows
+        constant = Y_00 * (lobe[0] * wide + under[0] * plain)
+        beyond = fold_expansion(lobe, mapped, *inverse(degree, v.dtype), spare)
+        return constant + beyond + fold_expansion(under, v, *inverse(BASE, v.dtype), spare)
+
+    # colours in a loop: compiled code would grow with their number
+    return of_colour((lobes[0], base[0]))[None] if len(lobes) == 1 else jax.lax.map(of_colour, (lobes, base))
+
+
+def _mapped(s: Float[Array, "5 p"], v: Loop, *, even: bool) -> tuple[Loop, Float[Array, "3 p"]]:
+    """The outline beyond the map, and there a direction from which all of it is within a quarter turn: A^-T z."""
+    a = stretch(s, even=even)
+    mapped = on_sphere(jnp.stack([dot(row[:, None], v) for row in a]))
+    # rows of the inverse, but for the determinant, which is positive: cross products of those of A
+    up = jnp.stack(
+        [
+            a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1],
+            a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2],
+            a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0],
+        ]
+    )
+    return mapped, on_sphere(up[:, None])[:, 0]
+
+
+def _in_plane(tables: Tables, theta: Float[Array, " p"], v: Loop, degree: int, spare: int) -> Float[Array, "c p"]:
+    count = tables.maps.shape[-1] - 4
+    weights, sine = _views.spline_weights(theta, count), jnp.sin(theta)[None]
+
+    def rows(table: Float[Array, "*c rows columns"], degree: int) -> Float[Array, "*c rows p"]:
+        m = orders(degree)
+        values = table @ weights
+        own = jnp.where(m[m >= 0][:, None] > 0, sine, 1)
+        return values * own.reshape((1,) * (values.ndim - 2) + own.shape)
+
+    s = rows(tables.maps, 2)[-3:]
+    s = jnp.concatenate([jnp.zeros_like(s[:2]), s])
+    return _of_map(s, rows(tables.lobes, degree), rows(tables.base, BASE), v, degree, spare, even=True)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def _even_integrals(tables: Tables, view: Float[Array, "p 3"], u: Loop, degree: int, spare: int) -> Array:
+    return _in_plane(tables, _views.elevation(view), turned(u, *_views.azimuth(view)), degree, spare)
+
+
+def _even_integrals_jvp(degree, spare, primals, tangents):
+    (tables, view, u), (d_tables, d_view, du) = primals, tangents
+    theta, (cos, sin) = _views.elevation(view), _views.azimuth(view)
+    v, sine = turned(u, cos, sin), jnp.sin(theta)
+    value = _in_plane(tables, theta, v, degree, spare)
+    change = jnp.zeros_like(value)
+    along = lambda f, x, dx: jax.jvp(f, (x,), (dx,))[1]
+    if not any(isinstance(d, SymbolicZero) for d in d_tables):
+        change += along(lambda t: _in_plane(t, theta, v, degree, spare), tables, d_tables)
+    dv = None if isinstance(du, SymbolicZero) else turned(du, cos, sin)
+    if not isinstance(d_view, SymbolicZero):
+        dx, dy, dz = d_view.T
+        d_theta, across = view[:, 2] * (cos * dx + sin * dy) - sine * dz, cos * dy - sin * dx
+        change += along(lambda t: _in_plane(tables, t, v, degree, spare), theta, d_theta)
+        steep = sine < _STEEP
+        turn = back(v) * (across * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine)))[None, None]
+        dv = turn if dv is None else dv + turn
+        change += _at_normal(tables, v, jnp.where(steep, across, 0), degree, spare)
+    if dv is not None:
+        change += along(lambda v: _in_plane(tables, theta, v, degree, spare), v, dv)
+    return value, change
+
+
+_even_integrals.defjvp(_even_integrals_jvp, symbolic_zeros=True)
+
+
+def back(v: Loop) -> Loop:
+    """How an outline moves in the frame of a plane that turns about z."""
+    return jnp.stack([v[1], -v[0], jnp.zeros_like(v[0])])
+
+
+def _at_normal(tables: Tables, v: Loop, across: Float[Array, " p"], degree: int, spare: int) -> Float[Array, "c p"]:
+    """The change with a step across the plane of views next to the normal; nothing where there is no step."""
+    near = jnp.full_like(across, _STEEP)
+
+    def turns(v: Loop) -> Float[Array, "c p"]:
+        move = back(v) * across[None, None]
+        return jax.jvp(lambda v: _in_plane(tables, near, v, degree, spare), (v,), (move,))[1] / _STEEP
+
+    other = lambda v: jnp.stack([-v[0], -v[1], v[2]])
+    both = lambda: (turns(v) - turns(other(v))) / 2
+    none = lambda: jnp.zeros((tables.lobes.shape[0], v.shape[2]), v.dtype)
+    return jax.lax.cond(jnp.any(across != 0), both, none)
