@@ -97,4 +97,4 @@ def _tagged(result: Result) -> Result:
     """The result of a call of `jax.jit`, which becomes one kernel."""
     from jax.experimental.xla_metadata import set_xla_metadata  # not in every version
 
-    return set_xla_metadata(result, **_TAG)
+    return set_xla_metadata(result, **_TAG)  # type: ignore[return-value]  # as it takes a value

@@ -31,11 +31,11 @@ _ENTRIES = np.array([
 ])  # fmt: skip
 _FULL = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # where an entry of the matrix is in that order
 
-Symmetric = tuple[Array, Array, Array, Array, Array, Array]
+Symmetric = tuple[Array, ...]  # entries xx, xy, xz, yy, yz, zz
 
 
-def stretch(s: Float[Array, "m *batch"], *, even: bool = False) -> Float[Array, "i j *batch"]:
-    """A = exp(S / 2) [3, 3, ...]; `even`, static: s_m = 0 for m < 0, and A maps the plane y = 0 to itself."""
+def stretch(s: Array, *, even: bool = False) -> Array:
+    """A = exp(S / 2) [3, 3, ...] of s [5, ...]; static `even`: s_m = 0 for m < 0, and A keeps the plane y = 0."""
     half = [sum(float(f) / 2 * s[m] for m, f in enumerate(row) if f) for row in _ENTRIES]
     half = [x + jnp.zeros_like(s[0]) for x in half]
     entries = _exp_even(*half) if even else _exp(tuple(half))
@@ -68,23 +68,29 @@ def _exp_even(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Array) 
 
 
 def _exp(x: Symmetric) -> Symmetric:
-    """By a series of the matrix over 2^6, squared as often; all factors commute, so that products are symmetric."""
+    """By the series of exp(x) - 1 of the matrix over 2^6, doubled as often: e -> 2 e + e^2 keeps the digits of small x.
+
+    All factors commute, so products are symmetric.
+    """
     x = tuple(a / 2**_DOUBLINGS for a in x)
     one, zero = jnp.ones_like(x[0]), jnp.zeros_like(x[0])
     identity = (one, zero, zero, one, zero, one)
-    result = identity
-    for k in range(10 if one.dtype.itemsize > 4 else 6, 0, -1):
-        result = tuple(i + p / k for i, p in zip(identity, _product(x, result), strict=True))
+    result = x
+    for k in range(10 if one.dtype.itemsize > 4 else 6, 1, -1):
+        result = _product(x, tuple(i + p / k for i, p in zip(identity, result, strict=True)))
     for _ in range(_DOUBLINGS):
-        result = _product(result, result)
-    return result
+        result = tuple(2 * e + p for e, p in zip(result, _product(result, result), strict=True))
+    return tuple(i + e for i, e in zip(identity, result, strict=True))
 
 
 def _product(a: Symmetric, b: Symmetric) -> Symmetric:
     rows = lambda m: [[m[i] for i in row] for row in _FULL]
     left, right = rows(a), rows(b)
     i, j = np.triu_indices(3)
-    return tuple(sum(left[p][k] * right[k][q] for k in range(3)) for p, q in zip(i, j, strict=True))
+    return tuple(
+        left[p][0] * right[0][q] + left[p][1] * right[1][q] + left[p][2] * right[2][q]
+        for p, q in zip(i, j, strict=True)
+    )
 
 
 def map_directions(a: Float[Array, "3 3"], w: Float[Array, "*batch 3"]) -> tuple[Array, Array]:

@@ -127,7 +127,7 @@ def fit_transformed(
 
     The map moves by Powell's dogleg method from each start; coefficients are the best for it at every step.
 
-    Arguments: `directions` [N, 3]; `values` [*colour, N], colours share the map and count alike; `solid_angles` [N] >=
+    Arguments: `directions` [N, 3]; `values` [*colour, N], colours share the map; `solid_angles` [N] >=
     0 in sr, the weights of the samples. Where there are none, as below the horizon, nothing holds the expansion. Static
     `base_degree`: plain harmonics to that degree are fitted beside it. `start` [3, 3] or [S, 3, 3], maps of positive
     determinant; by default four, from the moments of the samples. Static `even`: the lobe is even in y, as seen by a
@@ -136,8 +136,8 @@ def fit_transformed(
     for the best expansion beyond a given map, whose error is what the search makes small; `tolerance` of a step of the
     map that ends the search.
     Returns (expansion, error, status): a map that is symmetric and of determinant 1, for others with the same A^T A
-    only turn the expansion; `error` [*colour], relative, RMS over the samples; a `shisd.Status`, ok or `step_limit`,
-    which is an error but with `throw=False`, where the best expansion is kept.
+    only turn the expansion; `error` [*colour], RMS over the samples, relative to the brightest colour; a
+    `shisd.Status`, ok or `step_limit`, which is an error but with `throw=False`, where the best expansion is kept.
     Derivatives: in samples and weights, first ones, by the implicit function theorem, right where the search ended at a
     minimum; with max_steps=0 in the start too.
     Cost: steps x N x (degree + 1)^4 x 9, or 5 and (degree + 1)^4 / 4 of even lobes.
@@ -186,7 +186,7 @@ def search(
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
 def _search(starts: Array, w: Array, y: Array, areas: Array, ridge: Scalar, setting: Setting) -> tuple[Array, Array]:
     target, free = _target(y, areas), setting.free
-    place = lambda p: jnp.zeros(SIZE, w.dtype).at[free].set(p)
+    place = lambda p: jnp.zeros(SIZE, w.dtype).at[free].set(p, unique_indices=True)
 
     def residuals(p: Array, _: None) -> Array:
         return jnp.concatenate([_projected(*_columns(place(p), w, areas, ridge, setting), target), _NEAR**0.5 * p])
@@ -207,10 +207,10 @@ def _search_jvp(setting, primals, tangents):
     """At a minimum the slope of the squared error in the map stays 0 as the samples change."""
     starts, *samples = primals
     s, ended = _search(starts, *samples, setting)
-    slope = lambda s, *samples: _slope(s, *samples, setting)[setting.free]
-    place = lambda p: jnp.zeros(SIZE, s.dtype).at[setting.free].set(p)
+    slope = lambda s, w, y, areas, ridge: _slope(s, w, y, areas, ridge, setting)[setting.free]
+    place = lambda p: jnp.zeros(SIZE, s.dtype).at[setting.free].set(p, unique_indices=True)
     curvature = jax.jacfwd(slope)(s, *samples)[:, setting.free]
-    change = jax.jvp(lambda *samples: slope(s, *samples), samples, tangents[1:])[1]
+    change = jax.jvp(lambda *samples: slope(s, *samples), tuple(samples), tangents[1:])[1]
     return (s, ended), (place(-jnp.linalg.solve(curvature, change)), np.zeros((), jax.dtypes.float0))
 
 
@@ -234,10 +234,10 @@ def project_beyond(
     target = _target(y, areas)
     c, _ = _coefficients(columns, root, target)
     error = jnp.sqrt(jnp.sum((columns @ c - target) ** 2, axis=0)).reshape(y.shape[:-1])
-    c = c.T * _norms(y, areas)[:, None]
+    c = c.T * _norm(y, areas)
 
     def full(c: Array, degree: int) -> Array:
-        rows = jnp.zeros((len(c), (degree + 1) ** 2), c.dtype).at[:, setting.used(degree)].set(c)
+        rows = jnp.zeros((len(c), (degree + 1) ** 2), c.dtype).at[:, setting.used(degree)].set(c, unique_indices=True)
         return rows.reshape(*y.shape[:-1], -1)
 
     count = len(setting.used(setting.degree))
@@ -245,13 +245,14 @@ def project_beyond(
     return full(c[:, :count], setting.degree), base, error
 
 
-def _norms(y: Array, areas: Array) -> Float[Array, " colours"]:
-    square = jnp.sum(y.reshape(-1, y.shape[-1]) ** 2 * areas[None], axis=1)
-    return jnp.sqrt(jnp.where(square > 0, square, 1))  # a black colour is met by nothing
+def _norm(y: Array, areas: Array) -> Scalar:
+    """Of the largest colour: those that are dark count for little."""
+    square = jnp.max(jnp.sum(y.reshape(-1, y.shape[-1]) ** 2 * areas[None], axis=1))
+    return jnp.sqrt(jnp.where(square > 0, square, 1))  # black is met by nothing
 
 
 def _target(y: Array, areas: Array) -> Float[Array, "N colours"]:
-    return (y.reshape(-1, y.shape[-1]) * jnp.sqrt(areas)[None] / _norms(y, areas)[:, None]).T
+    return (y.reshape(-1, y.shape[-1]) * jnp.sqrt(areas)[None] / _norm(y, areas)).T
 
 
 def _columns(s: Array, w: Array, areas: Array, ridge: Scalar, setting: Setting) -> tuple[Float[Array, "N n"], Array]:

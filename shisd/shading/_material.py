@@ -1,7 +1,5 @@
 """Materials made ready: a form of their slices for light from all around, and one for light above the horizon."""
 
-import numpy as np
-
 from shisd import _checks
 from shisd._module import Module
 from shisd._progress import Progress
@@ -41,8 +39,13 @@ class Material(Module):
             raise ValueError(f"`local` must be shading.Slices; got {type(local).__name__}.")
         if not isinstance(lamps, TransformedSlices | None):
             raise ValueError(f"`lamps` must be shading.TransformedSlices; got {type(lamps).__name__}.")
-        if local is not None and lamps is not None and local.isotropic != lamps.isotropic:
-            raise ValueError("`local` and `lamps` are of an isotropic and an anisotropic material: make both of one.")
+        if local is not None and lamps is not None:
+            if local.isotropic != lamps.isotropic:
+                raise ValueError(
+                    "`local` and `lamps` are of an isotropic and an anisotropic material: make both of one."
+                )
+            if local.colour != lamps.colour:
+                raise ValueError(f"`local` {list(local.colour)} and `lamps` {list(lamps.colour)} are of other colours.")
         self.distant, self.local, self.lamps = distant, local, lamps
 
 
@@ -54,11 +57,16 @@ class LocalForms(Module):
 
     @property
     def isotropic(self) -> bool:
-        return (self.plain or self.lamps).isotropic  # type: ignore[union-attr]  # one is there
+        return self.uniform.isotropic
 
     @property
     def colour(self) -> tuple[int, ...]:
-        return np.broadcast_shapes(*(form.colour for form in (self.plain, self.lamps) if form is not None))
+        return self.uniform.colour
+
+    @property
+    def uniform(self) -> Slices | TransformedSlices:
+        """Those for light that is alike in all directions."""
+        return self.plain if self.lamps is None else self.lamps  # type: ignore[return-value]  # one is there
 
 
 def prepare(

@@ -15,6 +15,7 @@ from shisd.shading._tiles import Form, as_type, floating_type, sum_parts
 from shisd.shading.paths import _distant, _occluded, _polygon, _sphere, _zonal
 from shisd.shading.paths._path import Path
 from shisd.shading.slices._slices import Slices
+from shisd.shading.slices._transformed import TransformedSlices
 
 Light = TypeAliasType("Light", DistantLight | ZonalLight | Occluded | PolygonLight | PortalLight | SphereLight)
 PATHS: dict[type, Path] = {
@@ -28,7 +29,7 @@ PATHS: dict[type, Path] = {
 
 
 def shade(
-    material: Material | Slices | BrdfMatrix, lights: Light | Sequence[Light], surface: Surface
+    material: Material | Slices | TransformedSlices | BrdfMatrix, lights: Light | Sequence[Light], surface: Surface
 ) -> Float[Array, "*batch_colour"]:
     """Radiance that leaves surface points towards the viewer, from one light or the sum of several of any kinds.
 

@@ -13,7 +13,7 @@ frame given, v = in that of the plane, x, y, z with z the normal.
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from shisd._lanes import in_lanes
 from shisd._numerics import dot
-from shisd._typing import Array, Float
+from shisd._typing import Array, Bool, Float
 from shisd.decomposition.internal import stretch
 from shisd.domains.internal import Loop, fold_expansion, incidence_inverse, loop_solid_angle, on_sphere, zonal_inverse
 from shisd.harmonics.internal import orders
@@ -73,7 +73,7 @@ def integrals(
 def _of_map(
     s: Float[Array, "5 p"],
     lobes: Float[Array, "c rows p"],
-    base: Float[Array, "c rows p"],
+    base: Float[Array, "c k p"],
     v: Loop,
     degree: int,
     spare: int,
@@ -134,23 +134,25 @@ def _even_integrals_jvp(degree, spare, primals, tangents):
     (tables, view, u), (d_tables, d_view, du) = primals, tangents
     theta, (cos, sin) = _views.elevation(view), _views.azimuth(view)
     v, sine = turned(u, cos, sin), jnp.sin(theta)
-    value = _in_plane(tables, theta, v, degree, spare)
-    change = jnp.zeros_like(value)
-    along = lambda f, x, dx: jax.jvp(f, (x,), (dx,))[1]
+    moved: dict[str, tuple[Any, Any]] = {}
+    extra = None
     if not any(isinstance(d, SymbolicZero) for d in d_tables):
-        change += along(lambda t: _in_plane(t, theta, v, degree, spare), tables, d_tables)
+        moved["tables"] = (tables, d_tables)
     dv = None if isinstance(du, SymbolicZero) else turned(du, cos, sin)
     if not isinstance(d_view, SymbolicZero):
         dx, dy, dz = d_view.T
-        d_theta, across = view[:, 2] * (cos * dx + sin * dy) - sine * dz, cos * dy - sin * dx
-        change += along(lambda t: _in_plane(tables, t, v, degree, spare), theta, d_theta)
-        steep = sine < _STEEP
+        moved["theta"] = (theta, view[:, 2] * (cos * dx + sin * dy) - sine * dz)
+        across, steep = cos * dy - sin * dx, sine < _STEEP
         turn = back(v) * (across * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine)))[None, None]
         dv = turn if dv is None else dv + turn
-        change += _at_normal(tables, v, jnp.where(steep, across, 0), degree, spare)
+        extra = _at_normal(tables, v, steep, jnp.where(steep, across, 0), degree, spare)
     if dv is not None:
-        change += along(lambda v: _in_plane(tables, theta, v, degree, spare), v, dv)
-    return value, change
+        moved["v"] = (v, dv)
+    fixed = {"tables": tables, "theta": theta, "v": v}
+    of_moved = lambda moved: _in_plane(**(fixed | moved), degree=degree, spare=spare)
+    at, by = ({name: pair[k] for name, pair in moved.items()} for k in (0, 1))
+    value, change = jax.jvp(of_moved, (at,), (by,))
+    return value, change if extra is None else change + extra
 
 
 _even_integrals.defjvp(_even_integrals_jvp, symbolic_zeros=True)
@@ -161,15 +163,17 @@ def back(v: Loop) -> Loop:
     return jnp.stack([v[1], -v[0], jnp.zeros_like(v[0])])
 
 
-def _at_normal(tables: Tables, v: Loop, across: Float[Array, " p"], degree: int, spare: int) -> Float[Array, "c p"]:
-    """The change with a step across the plane of views next to the normal; nothing where there is no step."""
-    near = jnp.full_like(across, _STEEP)
-
-    def turns(v: Loop) -> Float[Array, "c p"]:
-        move = back(v) * across[None, None]
-        return jax.jvp(lambda v: _in_plane(tables, near, v, degree, spare), (v,), (move,))[1] / _STEEP
-
-    other = lambda v: jnp.stack([-v[0], -v[1], v[2]])
-    both = lambda: (turns(v) - turns(other(v))) / 2
+def _at_normal(
+    tables: Tables, v: Loop, steep: Bool[Array, " p"], across: Float[Array, " p"], degree: int, spare: int
+) -> Float[Array, "c p"]:
+    """The change with a step across the plane of views next to the normal, where they are `steep`; 0 elsewhere."""
     none = lambda: jnp.zeros((tables.lobes.shape[0], v.shape[2]), v.dtype)
-    return jax.lax.cond(jnp.any(across != 0), both, none)
+
+    def next_to_it() -> Float[Array, "c p"]:
+        both = jnp.concatenate([v, v * jnp.asarray([-1, -1, 1], v.dtype)[:, None, None]], axis=2)
+        move = back(both) * jnp.concatenate([across, -across])[None, None] / (2 * _STEEP)
+        near = jnp.full_like(both[0, 0], _STEEP)
+        turns = jax.jvp(lambda v: _in_plane(tables, near, v, degree, spare), (both,), (move,))[1]
+        return turns[:, : v.shape[2]] + turns[:, v.shape[2] :]
+
+    return jax.lax.cond(jnp.any(steep), next_to_it, none)

@@ -4,7 +4,7 @@ from tests.mutants import Mutant
 
 POLYGON, SURFACE = "tests/shading/test_polygon.py::", "tests/shading/test_surface.py::"
 MIRROR, SHADE = "tests/shading/test_mirror.py::", "tests/shading/test_shade.py::"
-LIGHTS = "tests/models/test_lights.py::"
+LIGHTS, BEYOND = "tests/models/test_lights.py::", "tests/shading/test_transformed.py::"
 OUTLINE, DISTANT = "shisd/models/lights/_outline.py", "shisd/models/lights/_distant.py"
 SLICES = "shisd/shading/slices/_slices.py"
 SIDES = LIGHTS + "test_outlines_are_positive_where_they_are_lit_and_nothing_behind"
@@ -39,6 +39,26 @@ MUTANTS = [
     Mutant(
         "frames do not turn with the normal", "shisd/shading/_frames.py",
         old="return r, jnp.cross(jnp.cross(normal, dn)[:, :, None], r, axis=1)", new="return r, 0 * r", test=SLICE,
+    ),
+    Mutant(
+        "no base under lobes", "shisd/shading/_transformed_integrals.py",
+        old="lobe[0] * wide + under[0] * plain", new="lobe[0] * wide + 0 * under[0] * plain",
+        test=BEYOND + "test_integrals_are_exact[True-float64]",
+    ),
+    Mutant(
+        "no change across the plane at the normal", "shisd/shading/_transformed_integrals.py",
+        old="change if extra is None else change + extra", new="change",
+        test=BEYOND + "test_derivatives_in_everything[True]",
+    ),
+    Mutant(
+        "a map of the opposite form", "shisd/decomposition/_stretch.py",
+        old="float(f) / 2 * s[m]", new="float(f) / -2 * s[m]",
+        test="tests/decomposition/test_transformed.py::test_a_map_is_the_exponential_of_half_its_form[float64-3.0-True]",
+    ),
+    Mutant(
+        "fits whose maps stay as samples change", "shisd/decomposition/_transformed.py",
+        old="place(-jnp.linalg.solve(curvature, change))", new="place(0 * jnp.linalg.solve(curvature, change))",
+        test="tests/decomposition/test_transformed.py::test_derivatives_of_a_fit",
     ),
     Mutant(
         "no clip at the horizon", "shisd/shading/paths/_polygon.py",

@@ -10,6 +10,7 @@ b . M c, and M^T b are the coefficients of the light that comes through the outl
 only they are turned to the local frame.
 """
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -40,7 +41,7 @@ from shisd.shading._tiles import shade_tiles, stacked, sum_lights
 from shisd.shading._transformed_integrals import integrals, tables_of
 from shisd.shading.paths._path import local_path
 from shisd.shading.slices._slices import Slices, lookup_factors, lookup_table, slice_values
-from shisd.shading.slices._transformed import dense_views
+from shisd.shading.slices._transformed import TransformedSlices, dense_views
 
 Light = PolygonLight | PortalLight
 _TILE = 256  # pixels at a time
@@ -52,11 +53,12 @@ Y_00 = math.sqrt(1 / (4 * math.pi))
 def _shade(
     points: dict[str, Float[Array, "p 3"]], forms: LocalForms, lights: list[Light], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
-    slices, lamps = forms.plain, forms.lamps
-    table = None if slices is None else lookup_table(slices)
-    tables = None if lamps is None else tables_of(lamps)
     kinds = stacked(lights)
-    stacks = [(stack, _products(stack, slices)) for stack in kinds]
+    stacks = [(stack, _products(stack, forms.plain)) for stack in kinds]
+    uniform = _integrals(forms.uniform)
+    directional = (
+        None if forms.plain is None else functools.partial(_directional, forms.plain, lookup_table(forms.plain))
+    )
 
     def of_tile(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
@@ -69,16 +71,11 @@ def _shade(
             above = dot(frame[:, :, 2].T[:, None], relative)
             sign = jnp.where(jnp.max(above, axis=0) > 0, facing(light, relative), 0)
             outline = _in_frame(frame, relative)
-            if product is None and tables is not None:
-                of_lamps = lambda v, spare: integrals(lamps, tables, dense_views(local), v, spare)
-                lit = _above_horizon(of_lamps, lamps.colour, outline, above, sign)
-                lit = times(lit, light.incident() * Y_00)
-            elif product is None:
-                of_slices = lambda v, spare: _uniform(slices, table, local, v, spare)
-                lit = _above_horizon(of_slices, slices.colour, outline, above, sign)
+            if product is None or directional is None:
+                lit = _above_horizon(functools.partial(uniform, local), forms.colour, outline, above, sign)
                 lit = times(lit, light.incident() * Y_00)
             else:
-                lit = _directional(slices, table, frame, local, outline, product)
+                lit = directional(frame, local, outline, product)
             return jnp.broadcast_to(times(lit, sign), zero.shape)
 
         return sum_lights(of_light, stacks, zero)
@@ -107,8 +104,16 @@ def _above_horizon(
     return jax.lax.cond(jnp.all(dark), nothing, lit)
 
 
+def _integrals(slices: Slices | TransformedSlices) -> Callable[[Array, Loop, int], Array]:
+    """integrals(local views, v, spare) of slices over outlines."""
+    if isinstance(slices, Slices):
+        return functools.partial(_uniform, slices, lookup_table(slices))
+    tables = tables_of(slices)
+    return lambda local, v, spare: integrals(slices, tables, dense_views(local), v, spare)
+
+
 def _uniform(slices: Slices, table: Array, local: Array, v: Loop, spare: int) -> Float[Array, "*colour p"]:
-    """Integrals of slices."""
+    """Integrals of plain slices."""
     angle = loop_solid_angle(v, 2 * np.pi, _up(v))
     if slices.isotropic:
         constant, of_colours = table[..., 0, :] @ lookup_factors(local, slices), table

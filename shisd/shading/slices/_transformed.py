@@ -33,7 +33,7 @@ class TransformedSlices(Module):
     harmonics, or [V, A, 5], [*colour, V, A, (L+1)^2] and [*colour, V, A, 9] of anisotropic materials (static
     `isotropic` False). A map is the band of degree 2 of the logarithm of its metric A^T A. Views are those of `Slices`
     after z is multiplied by 1/3, so that they stand close near the horizon. `errors` [*colour, V] or [*colour, V, A]:
-    of each fit, relative, RMS above the horizon.
+    of each fit, RMS above the horizon, relative to the brightest colour.
     """
 
     maps: Float[Array, "*views 5"]
@@ -76,7 +76,7 @@ class TransformedSlices(Module):
         return self.coefficients.shape[: -2 if self.isotropic else -3]
 
     @method
-    def at(self, view: Float[Array, "3"]) -> TransformedExpansion:
+    def at(self, view: ArrayLike) -> TransformedExpansion:
         """The slice seen from the local direction `view` [3], interpolated, in the local frame.
 
         Derivatives: in the view and all fields, also at the normal.
@@ -113,7 +113,21 @@ def transform_brdf(
     quadrature: int = 32,
     ridge: float = 1e-5,
 ) -> TransformedSlices:
-    """A material's cosine-weighted slices above the horizon, each beyond the map that makes it smoothest."""
+    """A material's cosine-weighted slices above the horizon, each beyond the map that makes it smoothest.
+
+    For polygons that shine alike in all directions: `shade` takes the result as it is, or with the other slices of a
+    material as `Material(distant, local, lamps)`, which `prepare(..., lamp_degree=)` makes.
+    Arguments: `brdf`. Static: `degree`, of which 4 or 8 are enough for any sharpness; `elevations`, at least 4, and
+    `azimuths`, for anisotropic materials only, by default 2 degree + 4 and at least 16; `quadrature`, nodes from the
+    mirror direction to the horizon. `ridge` limits coefficients that nothing above the horizon shows; it grows towards
+    grazing views. The result has the dtype of the material's parameters; `errors` says how near each view is.
+    Derivatives: in every parameter of the material, first ones, both modes; of alpha to 3e-3 (the searches end near
+    their minima, not at them).
+    Accuracy: between the nodes of the table, over the norm of the slice, GGX of alpha 0.02 to 0.5 in float32, at degree
+    4 at most 9e-3 for views to 60 degrees, 3e-2 at 75, 7e-2 at 85 and 0.2 at 89.9; at degree 8 1.4e-3, 6e-3, 2.4e-2 and
+    0.16. Plain slices of degree 16 have 4e-2, 0.2 and 0.3 for alpha 0.25.
+    Cost: 2 to 5 s on two cores for isotropic materials, after 12 s of compilation; anisotropic ones a minute and more.
+    """
     if not isinstance(brdf, AbstractBrdf):
         raise ValueError(f"`brdf` must be a models.AbstractBrdf; got {type(brdf).__name__}.")
     degree, elevations = _checks.degree(degree), _checks.integer("elevations", elevations, 4)
