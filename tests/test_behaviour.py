@@ -121,6 +121,8 @@ kernels = lambda: decomposition.IsotropicBasis(
     decomposition.GaussianKernel(np.array([1, 2, 4], np.float32)), decomposition.separate_directions(2), 2
 )
 gaussians = lambda: decomposition.GaussianLobes(W[:2], np.array([2, 5], np.float32), normal(3, 2))
+beyond = lambda: decomposition.TransformedExpansion(np.eye(3, dtype=np.float32) + 0.2 * normal(3, 3), normal(3, 9))
+stretched = lambda: shading.TransformedSlices(0.2 * normal(4, 5), normal(3, 4, 4), normal(3, 4, 9))
 stack = lambda objects: jax.tree.map(lambda *leaves: np.stack(leaves), *objects)
 polygons = lambda: stack([domains.SphericalPolygon(t) for t in TRIANGLES])
 panel = lambda: models.PolygonLight(PANEL, np.ones(3, np.float32))
@@ -282,6 +284,14 @@ CASES = [
         lambda: (gaussians(), SAMPLES, HEIGHTS, AREAS),
         heavy=True,
         idle=("*",),
+    ),
+    Case("decomposition.TransformedExpansion.directions", lambda f, w: f.directions(w), lambda: (beyond(), W), (1,)),
+    Case("decomposition.TransformedExpansion.evaluate", lambda f, w: f.evaluate(w), lambda: (beyond(), W)),
+    Case(
+        "decomposition.fit_transformed",
+        lambda w, y, a: decomposition.fit_transformed(w, y, a, 1, start=np.eye(3), max_steps=0).expansion,
+        lambda: (SAMPLES, HEIGHTS, AREAS),
+        heavy=True,
     ),
     Case(
         "decomposition.sparse_weights",
@@ -454,6 +464,14 @@ CASES = [
         lambda f: shading.tabulate_brdf(f, 2, elevations=4, quadrature=48, throw=False),
         lambda: (BRDFS["Phong"](),),
         heavy=True,
+    ),
+    Case("shading.TransformedSlices.at", lambda s, v: s.at(v), lambda: (stretched(), UP[0]), idle=("errors",)),
+    Case(
+        "shading.transform_brdf",
+        lambda f: shading.transform_brdf(f, 1, elevations=4, quadrature=8),
+        lambda: (BRDFS["Phong"](),),
+        heavy=True,
+        idle=("*",),  # searches end near minima, which is not near enough for differences
     ),
     Case(
         "shading.project_brdf",

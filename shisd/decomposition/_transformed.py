@@ -185,6 +185,8 @@ def search(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
 def _search(starts: Array, w: Array, y: Array, areas: Array, ridge: Scalar, setting: Setting) -> tuple[Array, Array]:
+    dtype, wide = w.dtype, jax.dtypes.canonicalize_dtype(np.float64)  # the one that optimistix's own numbers have
+    starts, w, y, areas, ridge = (x.astype(wide) for x in (starts, w, y, areas, ridge))
     target, free = _target(y, areas), setting.free
     place = lambda p: jnp.zeros(SIZE, w.dtype).at[free].set(p, unique_indices=True)
 
@@ -199,7 +201,7 @@ def _search(starts: Array, w: Array, y: Array, areas: Array, ridge: Scalar, sett
 
     maps, errors, ended = jax.lax.map(run, starts)
     best = jnp.nanargmin(errors)
-    return maps[best], ended[best]
+    return maps[best].astype(dtype), ended[best]
 
 
 @_search.defjvp

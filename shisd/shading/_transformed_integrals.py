@@ -29,7 +29,7 @@ from shisd.harmonics.internal import orders
 from shisd.shading import _views
 from shisd.shading._incidence import _turned as turned
 from shisd.shading.slices._slices import lookup_table, slice_values
-from shisd.shading.slices._transformed import BASE, TransformedSlices
+from shisd.shading.slices._transformed import BASE, TransformedSlices, parts_of
 
 _STEEP = 1e-3  # s up to which the plane turns too fast
 Y_00 = math.sqrt(1 / (4 * math.pi))
@@ -44,7 +44,7 @@ class Tables(NamedTuple):
 
 
 def tables_of(slices: TransformedSlices) -> Tables:
-    maps, lobes, base = (lookup_table(part) for part in slices.parts())
+    maps, lobes, base = (lookup_table(part) for part in parts_of(slices))
     of_colours = lambda table: table.reshape(-1, *table.shape[-2:])
     if not slices.isotropic:
         return Tables(maps, of_colours(lobes), of_colours(base))
@@ -64,7 +64,7 @@ def integrals(
         values = _even_integrals(tables, view, u, slices.degree, spare)
     else:
         maps, lobes, base = (
-            slice_values(table, view, part) for table, part in zip(tables, slices.parts(), strict=True)
+            slice_values(table, view, part) for table, part in zip(tables, parts_of(slices), strict=True)
         )
         values = _of_map(maps[-5:], lobes, base, u, slices.degree, spare, even=False)
     return values.reshape(*slices.colour, -1)

@@ -76,7 +76,7 @@ def samples(rng, count=1200):
 
 
 @FLOAT64_FIRST
-@pytest.mark.parametrize("even", [True, False])
+@pytest.mark.parametrize("even", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_fit_finds_the_map_again(even, dtype, rng):
     w, areas = samples(rng)
     s, sign = np.array([0.4, -0.3, -0.9, 0.7, 0.5]) * (EVEN if even else 1), np.array([0, 0, 1, 1])
@@ -96,6 +96,7 @@ def test_a_fit_finds_the_map_again(even, dtype, rng):
     np.testing.assert_array_equal(black, 0)
 
 
+@pytest.mark.slow
 def test_a_narrow_lobe_needs_few_bands_beyond_a_map(rng):
     """A lobe with long tails, of 3 degrees half width: 40 times nearer than any plain expansion of its degree."""
     x, y = np.meshgrid(np.linspace(0, 2 * np.pi, 40, endpoint=False), np.sinh(np.linspace(0.03, 3.6, 60)) / 20)

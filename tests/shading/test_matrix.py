@@ -242,7 +242,8 @@ def test_errors_name_the_argument(as_user, rng):
     light, normals, views, _ = scene(rng, 2, np.float32)
     sky, surface = models.DistantLight(light), shading.Surface(normals, views)
     with pytest.raises(
-        ValueError, match="`material` must come from shading.prepare, tabulate_brdf or project_brdf; got i"
+        ValueError,
+        match="`material` must come from shading.prepare, tabulate_brdf, transform_brdf or project_brdf; got i",
     ):
         shading.shade(1, sky, surface)
     with pytest.raises(

@@ -309,6 +309,7 @@ def test_gradients_keep_no_tile_of_each_light(rng):
     assert memory(20) < 1.1 * memory(2)  # measured 1.00
 
 
+@pytest.mark.slow
 def test_a_portal_is_the_light_behind_it(rng):
     """Several windows, and what changes with the light in their field; far away as at the origin."""
     slices, (position, normal, view) = random("float32"), (np.round(64 * a) / 64 for a in scene(rng, 4))

@@ -242,7 +242,7 @@ def test_what_a_surface_lacks(as_user, rng):
 
 def test_what_is_no_material(as_user, rng):
     light, surface = lights_of(rng, np.float32)["map"], surface_of(rng, np.float32)
-    where = "`material` must come from shading.prepare, tabulate_brdf or project_brdf; got"
+    where = "`material` must come from shading.prepare, tabulate_brdf, transform_brdf or project_brdf; got"
     fails(f"{where} Lambertian. Make it ready by shading.prepare.", models.Lambertian(0.5), light, surface)
     fails(f"{where} ndarray.", np.ones((8, 9), np.float32), light, surface)
 
@@ -267,7 +267,7 @@ def test_colours_that_do_not_broadcast(as_user, rng):
 def test_materials_are_made_of_forms_that_fit(as_user):
     upper, sphere = (random_slices(2, np.float32, domain=domain) for domain in ("upper", "sphere"))
     for message, arguments in (
-        ("a material needs `distant` or `local` slices; got neither.", (None, None)),
+        ("a material needs `distant`, `local` or `lamps` slices; got none.", (None, None)),
         ("`distant` must be shading.Slices or BrdfMatrix; got int.", (1, None)),
         ("`distant` was fitted above the horizon only; make it with domain='sphere'.", (upper, sphere)),
         ("`local` must be shading.Slices; got int.", (sphere, 1)),

@@ -93,5 +93,7 @@ def test_errors_name_the_argument(as_user, rng):
         message = r"`coefficients` must have shape \[L\+1\] or \[colour, L\+1\]; got \[.*\]\."
         with pytest.raises(ValueError, match=message):
             models.ZonalLight(axis, wrong)
-    with pytest.raises(ValueError, match="`material` must come from shading.prepare, tabulate_brdf or project_brdf"):
+    with pytest.raises(
+        ValueError, match="`material` must come from shading.prepare, tabulate_brdf, transform_brdf or project_brdf"
+    ):
         shade(1, models.ZonalLight(axis, z), normals, views)

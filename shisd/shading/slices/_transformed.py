@@ -84,13 +84,14 @@ class TransformedSlices(Module):
         view = _checks.vectors("view", view).astype(self.coefficients.dtype)
         view = dense_views(view[None])
         look_up = lambda slices: slice_values(lookup_table(slices), view, slices)[..., 0]
-        maps, expansions, base = self.parts()
+        maps, expansions, base = parts_of(self)
         return TransformedExpansion(stretch(look_up(maps)[-5:]), look_up(expansions), look_up(base))
 
-    def parts(self) -> tuple[Slices, Slices, Slices]:
-        """Maps, expansions beyond them, and bases, as slices to look up."""
-        made = lambda c: Slices(c, isotropic=self.isotropic, domain="upper")
-        return as_slices(self.maps, self.isotropic), made(self.coefficients), made(self.base)
+
+def parts_of(slices: TransformedSlices) -> tuple[Slices, Slices, Slices]:
+    """Maps, expansions beyond them, and bases, as slices to look up."""
+    made = lambda c: Slices(c, isotropic=slices.isotropic, domain="upper")
+    return as_slices(slices.maps, slices.isotropic), made(slices.coefficients), made(slices.base)
 
 
 def dense_views(views: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
