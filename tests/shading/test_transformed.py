@@ -194,10 +194,10 @@ def test_gradients_in_the_material(x64):
 @pytest.mark.slow
 def test_brushed_materials():
     brdf = models.Ggx(np.float32([0.1, 0.3]), np.float32(1))
-    slices = shading.transform_brdf(brdf, 4, elevations=12, azimuths=16)
+    slices = shading.transform_brdf(brdf, 4, elevations=12, azimuths=16, quadrature=12)
     assert slices.maps.shape == (12, 16, 5) and not slices.isotropic
     error = np.asarray(slices.errors)
-    assert np.max(error[:6]) < 0.1 and np.median(error[:6]) < 0.01 and np.max(error) < 0.25
+    assert np.max(error[0]) < 0.01 and np.max(error[:6]) < 0.1 and np.max(error) < 0.3
 
 
 def test_prepared_materials_take_them_under_lamps(as_user, rng):

@@ -127,7 +127,7 @@ def transform_brdf(
     Accuracy: between the nodes of the table, over the norm of the slice, GGX of alpha 0.02 to 0.5 in float32, at degree
     4 at most 9e-3 for views to 60 degrees, 3e-2 at 75, 7e-2 at 85 and 0.2 at 89.9; at degree 8 1.4e-3, 6e-3, 2.4e-2 and
     0.16. Plain slices of degree 16 have 4e-2, 0.2 and 0.3 for alpha 0.25.
-    Cost: 2 to 5 s on two cores for isotropic materials, after 12 s of compilation; anisotropic ones a minute and more.
+    Cost: 2 to 5 s on two cores for isotropic materials, after 12 s of compilation; anisotropic ones some minutes.
     """
     if not isinstance(brdf, AbstractBrdf):
         raise ValueError(f"`brdf` must be a models.AbstractBrdf; got {type(brdf).__name__}.")
