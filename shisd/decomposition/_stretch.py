@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from shisd._numerics import normalize
 from shisd._typing import Array, Float
 
 SIZE = 5
@@ -100,12 +101,12 @@ def map_directions(a: Float[Array, "3 3"], w: Float[Array, "*batch 3"]) -> tuple
     return mapped / length, jnp.linalg.det(a) / length[..., 0] ** 3
 
 
-def moments_starts(w: Array, mass: Float[Array, " N"], even: bool) -> Float[Array, "4 5"]:
-    """Maps that widen a lobe of this `mass` until it fills the sphere, and half, a quarter and an eighth as far."""
+def moments_starts(w: Array, y: Float[Array, "*colour N"], areas: Array, even: bool) -> Float[Array, "4 5"]:
+    """Maps that widen a lobe of samples y until it fills the sphere, and half, a quarter and an eighth as far."""
+    mass = jnp.sum(jnp.abs(y.reshape(-1, len(w))), axis=0) * areas
     mass = mass / jnp.sum(mass)
     plane = jnp.asarray([1.0, 0 if even else 1, 1], w.dtype)
-    z = mass @ w * plane
-    z = z / jnp.sqrt(jnp.sum(z * z))
+    z = normalize(mass @ w * plane)
     aside = w - (w @ z)[:, None] * z[None]
     spread = (aside * mass[:, None]).T @ aside
     if even:

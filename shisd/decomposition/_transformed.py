@@ -160,8 +160,7 @@ def fit_transformed(
 @eqx.filter_jit
 def _fit(starts: Array | None, w: Array, y: Array, areas: Array, ridge: float, setting: Setting) -> TransformedFit:
     if starts is None:
-        mass = jnp.sum(jnp.abs(y.reshape(-1, len(w))), axis=0) * areas
-        s = moments_starts(w, mass, setting.even)
+        s = moments_starts(w, y, areas, setting.even)
     else:
         s = jax.vmap(log_stretch)(starts.reshape(-1, 3, 3))
     best, ended = search(s, w, y, areas, jnp.asarray(ridge, w.dtype), setting)
@@ -219,7 +218,7 @@ def _search_jvp(setting, primals, tangents):
 def _slope(s: Array, w: Array, y: Array, areas: Array, ridge: Scalar, setting: Setting) -> Float[Array, " 5"]:
     """Of half the squared error of the best expansion, in the map; its derivatives are exact, once."""
     target = _target(y, areas)
-    c = _coefficients(*_columns(s, w, areas, ridge, setting), target)[0]
+    c = _coefficients(*_columns(s, w, areas, ridge, setting), target)
 
     def half_error(s: Array) -> Array:
         columns, root = _columns(s, w, areas, ridge, setting)
@@ -234,7 +233,7 @@ def project_beyond(
     """Coefficients of the nearest expansion beyond a map, those of the base, and its relative error by colour."""
     columns, root = _columns(s, w, areas, ridge, setting)
     target = _target(y, areas)
-    c, _ = _coefficients(columns, root, target)
+    c = _coefficients(columns, root, target)
     error = jnp.sqrt(jnp.sum((columns @ c - target) ** 2, axis=0)).reshape(y.shape[:-1])
     c = c.T * _norm(y, areas)
 
@@ -277,12 +276,12 @@ def _solve(columns: Array, ridge: Array, target: Array) -> tuple[Float[Array, "n
     return solve_triangular(r, share), target - q @ share, q, r
 
 
-def _coefficients(columns: Array, ridge: Array, target: Array) -> tuple[Float[Array, "n colours"], Array]:
-    """c and R, by a step of Newton's method at c, where it is 0: so its first derivatives are those of c."""
+def _coefficients(columns: Array, ridge: Array, target: Array) -> Float[Array, "n colours"]:
+    """c, by a step of Newton's method at c, where it is 0: so its first derivatives are those of c."""
     c, _, _, r = jax.lax.stop_gradient(_solve(columns, ridge, target))
     uphill = columns.T @ (columns @ c - target) + ridge**2 * c
     uphill = uphill - jax.lax.stop_gradient(uphill)  # but for rounding
-    return c - solve_triangular(r, solve_triangular(r, uphill, trans="T")), r
+    return c - solve_triangular(r, solve_triangular(r, uphill, trans="T"))
 
 
 def _projected(columns: Float[Array, "N n"], ridge: Array, target: Float[Array, "N colours"]) -> Array:

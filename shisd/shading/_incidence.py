@@ -11,16 +11,20 @@ rows of the slice, of which c_m / s is smooth for m > 0; u = an outline in the f
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from shisd._numerics import times
 from shisd._typing import Array, Float
-from shisd.domains.internal import Loop, fold_expansion, incidence_inverse
+from shisd.domains.internal import Loop, fold_expansion, incidence_inverse, loop_solid_angle
 from shisd.harmonics.internal import orders
 from shisd.shading import _views
 
+Y_00 = math.sqrt(1 / (4 * math.pi))
 _STEEP = 0.01  # s up to which the plane turns too fast
 
 
@@ -34,24 +38,24 @@ def incidence_integrals(
 
     Derivatives: the first exact for every view, along the normal too; those in the view along the sphere.
     """
-    return _fold(_slices(table, _views.elevation(view), degree), _turned(u, *_views.azimuth(view)), degree, spare)
+    return _fold(rows_at(table, _views.elevation(view), degree), turned(u, *_views.azimuth(view)), degree, spare)
 
 
 def _incidence_integrals_jvp(degree, spare, primals, tangents):
     (table, view, u), (d_table, d_view, du) = primals, tangents
     value = incidence_integrals(table, view, u, degree, spare)
     theta, (cos, sin) = _views.elevation(view), _views.azimuth(view)
-    v, change, dv, across = _turned(u, cos, sin), jnp.zeros_like(value), jnp.zeros_like(u), None
+    v, change, dv, across = turned(u, cos, sin), jnp.zeros_like(value), jnp.zeros_like(u), None
     if not isinstance(d_table, SymbolicZero):
-        in_table = lambda t: _fold(_slices(t, theta, degree), v, degree, spare)
+        in_table = lambda t: _fold(rows_at(t, theta, degree), v, degree, spare)
         change += jax.jvp(in_table, (table,), (d_table,))[1]
     if not isinstance(d_view, SymbolicZero):
         dx, dy, dz = d_view.T
         along, across = cos * dx + sin * dy, cos * dy - sin * dx
-        _, steeper = jax.jvp(lambda t: _slices(table, t, degree), (theta,), (jnp.ones_like(theta),))
+        _, steeper = jax.jvp(lambda t: rows_at(table, t, degree), (theta,), (jnp.ones_like(theta),))
         change += _fold(steeper, v, degree, spare) * (view[:, 2] * along - jnp.sin(theta) * dz)
     if not isinstance(du, SymbolicZero):
-        dv += _turned(du, cos, sin)
+        dv += turned(du, cos, sin)
     if not (isinstance(du, SymbolicZero) and across is None):
         change += _outline_moves(table, theta, v, dv, across, degree, spare)
     return value, change
@@ -66,32 +70,43 @@ def _outline_moves(
     """Change of the integrals where v moves by dv and the view by `across`, at right angles to the plane."""
 
     def moves(by: Loop, over_sine: bool) -> Array:
-        rows = _slices(table, theta, degree, over_sine=over_sine)
+        rows = rows_at(table, theta, degree, over_sine=over_sine)
         return jax.jvp(lambda v: _fold(rows, v, degree, spare), (v,), (by,))[1]
 
     if across is None:
         return moves(dv, False)
     # the plane turns by across / s, and v in it turns back
-    back, sine = jnp.stack([v[1], -v[0], jnp.zeros_like(v[0])]) * across[None, None], jnp.sin(theta)
+    turn, sine = back(v) * across[None, None], jnp.sin(theta)
     steep = sine < _STEEP
-    dv += back * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]
-    none, at_normal = lambda: jnp.zeros_like(theta), lambda: moves(jnp.where(steep[None, None], back, 0), True)
+    dv += turn * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]
+    none, at_normal = lambda: jnp.zeros_like(theta), lambda: moves(jnp.where(steep[None, None], turn, 0), True)
     return moves(dv, False) + jax.lax.cond(jnp.any(steep), at_normal, none)
 
 
-def _slices(table: Array, theta: Array, degree: int, *, over_sine: bool = False) -> Float[Array, "rows p"]:
-    """Rows m >= 0 of the slices in the frame of the plane; `over_sine`, those with m > 0 over s, for m = 0 zeros."""
+def rows_at(table: Array, theta: Array, degree: int, *, over_sine: bool = False) -> Float[Array, "*c rows p"]:
+    """Rows m >= 0 of slices in the frame of the plane; `over_sine`, those with m > 0 over s, for m = 0 zeros."""
     m = orders(degree)
-    rows = table[m >= 0] @ _views.spline_weights(theta, table.shape[1] - 4)
+    rows = table[..., m >= 0, :] @ _views.spline_weights(theta, table.shape[-1] - 4)
     scale = (0.0, 1.0) if over_sine else (1.0, jnp.sin(theta)[None])
-    return rows * jnp.where(m[m >= 0][:, None] > 0, scale[1], scale[0])
+    return times(rows, jnp.where(m[m >= 0][:, None] > 0, scale[1], scale[0]))
 
 
 def _fold(rows: Float[Array, "rows p"], v: Loop, degree: int, spare: int) -> Float[Array, " p"]:
     return fold_expansion(rows, v, *incidence_inverse(degree, rows.dtype), spare)
 
 
-def _turned(u: Loop, cos: Array, sin: Array) -> Loop:
+def turned(u: Loop, cos: Array, sin: Array) -> Loop:
     """The frame turned about z to this azimuth, and u in it."""
     cos, sin = cos[None], sin[None]
     return jnp.stack([cos * u[0] + sin * u[1], cos * u[1] - sin * u[0], u[2]])
+
+
+def back(v: Loop) -> Loop:
+    """How an outline moves in the frame of a plane that turns about z."""
+    return jnp.stack([v[1], -v[0], jnp.zeros_like(v[0])])
+
+
+def angle_above(v: Loop) -> Float[Array, " p"]:
+    """Solid angles of outlines above the horizon."""
+    up = jnp.broadcast_to(jnp.asarray([0, 0, 1], v.dtype)[:, None], (3, v.shape[2]))
+    return loop_solid_angle(v, 2 * np.pi, up)

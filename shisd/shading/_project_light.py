@@ -11,9 +11,10 @@ from shisd._typing import Array, ArrayLike, Float
 from shisd.domains import HaarBasis
 from shisd.domains.internal import clip_to_cells, loop_coefficients, loop_solid_angle, on_sphere
 from shisd.models.internal import facing, towards
+from shisd.shading._incidence import Y_00
 from shisd.shading._surface import masks
 from shisd.shading._tiles import as_type, finite_mark, finite_or_nan, in_tiles, shade_points
-from shisd.shading.paths._polygon import SMALL_TILE, Y_00, Light, product_of, through
+from shisd.shading.paths._polygon import SMALL_TILE, Light, product_of, through
 
 
 def project_light(

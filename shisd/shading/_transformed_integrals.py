@@ -12,7 +12,6 @@ frame given, v = in that of the plane, x, y, z with z the normal.
 """
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -21,18 +20,16 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from shisd._lanes import in_lanes
-from shisd._numerics import dot
+from shisd._numerics import cross, dot
 from shisd._typing import Array, Bool, Float
 from shisd.decomposition.internal import stretch
 from shisd.domains.internal import Loop, fold_expansion, incidence_inverse, loop_solid_angle, on_sphere, zonal_inverse
-from shisd.harmonics.internal import orders
 from shisd.shading import _views
-from shisd.shading._incidence import _turned as turned
+from shisd.shading._incidence import Y_00, angle_above, back, rows_at, turned
 from shisd.shading.slices._slices import lookup_table, slice_values
 from shisd.shading.slices._transformed import BASE, TransformedSlices, parts_of
 
 _STEEP = 1e-3  # s up to which the plane turns too fast
-Y_00 = math.sqrt(1 / (4 * math.pi))
 
 
 class Tables(NamedTuple):
@@ -46,10 +43,7 @@ class Tables(NamedTuple):
 def tables_of(slices: TransformedSlices) -> Tables:
     maps, lobes, base = (lookup_table(part) for part in parts_of(slices))
     of_colours = lambda table: table.reshape(-1, *table.shape[-2:])
-    if not slices.isotropic:
-        return Tables(maps, of_colours(lobes), of_colours(base))
-    even = lambda table: table[..., orders(math.isqrt(table.shape[-2]) - 1) >= 0, :]
-    return Tables(even(maps), even(of_colours(lobes)), even(of_colours(base)))
+    return Tables(maps, of_colours(lobes), of_colours(base))
 
 
 def integrals(
@@ -82,8 +76,7 @@ def _of_map(
 ) -> Float[Array, "c p"]:
     inverse = incidence_inverse if even else zonal_inverse
     mapped, up = in_lanes(functools.partial(_mapped, even=even), (s, v))
-    normal = jnp.broadcast_to(jnp.asarray([0, 0, 1], v.dtype)[:, None], up.shape)
-    wide, plain = loop_solid_angle(mapped, 2 * np.pi, up), loop_solid_angle(v, 2 * np.pi, normal)
+    wide, plain = loop_solid_angle(mapped, 2 * np.pi, up), angle_above(v)
 
     def of_colour(rows: tuple[Array, Array]) -> Float[Array, " p"]:
         lobe, under = rows
@@ -99,30 +92,15 @@ def _mapped(s: Float[Array, "5 p"], v: Loop, *, even: bool) -> tuple[Loop, Float
     """The outline beyond the map, and there a direction from which all of it is within a quarter turn: A^-T z."""
     a = stretch(s, even=even)
     mapped = on_sphere(jnp.stack([dot(row[:, None], v) for row in a]))
-    # rows of the inverse, but for the determinant, which is positive: cross products of those of A
-    up = jnp.stack(
-        [
-            a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1],
-            a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2],
-            a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0],
-        ]
-    )
+    up = cross(a[0], a[1])  # the last column of the inverse transposed, but for the determinant, which is positive
     return mapped, on_sphere(up[:, None])[:, 0]
 
 
 def _in_plane(tables: Tables, theta: Float[Array, " p"], v: Loop, degree: int, spare: int) -> Float[Array, "c p"]:
-    count = tables.maps.shape[-1] - 4
-    weights, sine = _views.spline_weights(theta, count), jnp.sin(theta)[None]
-
-    def rows(table: Float[Array, "*c rows columns"], degree: int) -> Float[Array, "*c rows p"]:
-        m = orders(degree)
-        values = table @ weights
-        own = jnp.where(m[m >= 0][:, None] > 0, sine, 1)
-        return values * own.reshape((1,) * (values.ndim - 2) + own.shape)
-
-    s = rows(tables.maps, 2)[-3:]
+    s, lobes, base = (rows_at(table, theta, d) for table, d in zip(tables, (2, degree, BASE), strict=True))
+    s = s[-3:]
     s = jnp.concatenate([jnp.zeros_like(s[:2]), s])
-    return _of_map(s, rows(tables.lobes, degree), rows(tables.base, BASE), v, degree, spare, even=True)
+    return _of_map(s, lobes, base, v, degree, spare, even=True)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
@@ -156,11 +134,6 @@ def _even_integrals_jvp(degree, spare, primals, tangents):
 
 
 _even_integrals.defjvp(_even_integrals_jvp, symbolic_zeros=True)
-
-
-def back(v: Loop) -> Loop:
-    """How an outline moves in the frame of a plane that turns about z."""
-    return jnp.stack([v[1], -v[0], jnp.zeros_like(v[0])])
 
 
 def _at_normal(

@@ -105,7 +105,7 @@ def sphere_points(rows, columns):
 def slice_samples(brdf, theta, nodes=20):
     """Directions, colours [3, N] and solid angles of the slice of one elevation: graded nodes above, few below."""
     view = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-    w, area = _tabulate._nodes(view, jnp.asarray(brdf.lobe_width, view.dtype), nodes, half=False)
+    w, area = _tabulate.slice_nodes(view, jnp.asarray(brdf.lobe_width, view.dtype), nodes, half=False)
     with jax.ensure_compile_time_eval():
         below, area_below = harmonics.sphere_rule(60, dtype=view.dtype)
         low = np.asarray(below[:, 2]) < 0

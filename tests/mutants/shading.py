@@ -29,7 +29,7 @@ MUTANTS = [
     ),
     Mutant(
         "the plane of incidence does not turn with the view", "shisd/shading/_incidence.py",
-        old="dv += back * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]", new="dv += 0 * back",
+        old="dv += turn * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine))[None, None]", new="dv += 0 * turn",
         test=SLICE,
     ),
     Mutant(

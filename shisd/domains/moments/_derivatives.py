@@ -40,21 +40,22 @@ def _moments_jvp(degree, primals, tangents):
 
 def _moved(axes: Float[Array, "k 3"], v: Loop, dv: Loop, degree: int) -> Float[Array, "l k p"]:
     """Changes of the moments with the vertices."""
-    start, end = (x[:, None] for x in speeds(unpack(Spans, spans_of(v)), dv))
-    a, b = in_lanes(functools.partial(_at_vertices, degree=degree), (v,), (axes,))
+    a, b, normal = in_lanes(functools.partial(_at_vertices, degree=degree), (v,), (axes,))
+    start, end = (x[:, None] for x in speeds(normal, dv))
     return -jnp.sum(start[None] * a + end[None] * b, axis=1)
 
 
-def _at_vertices(v: Loop, axes: Float[Array, "k 3"], degree: int) -> tuple[Array, Array]:
-    """The integrals of `at_vertices` for l = 1 ... degree, [l, e, k, p] each."""
-    spans = unpack(Spans, spans_of(v)[:, :, None])
+def _at_vertices(v: Loop, axes: Float[Array, "k 3"], degree: int) -> tuple[Array, Array, Loop]:
+    """The integrals of `at_vertices` for l = 1 ... degree, [l, e, k, p] each, and theta n."""
+    packed = spans_of(v)
+    spans = unpack(Spans, packed[:, :, None])
     terms = boundary(spans, axes.T[:, None, :, None])
 
     def step(state: _BoundaryState, n: Factors) -> tuple[_BoundaryState, tuple[Array, Array]]:
         state = terms.advance(state, n)
         return state, at_vertices(spans, state.middle, state.chord)
 
-    return jax.lax.scan(step, terms.start(), factors_of(1, degree, v.dtype))[1]
+    return *jax.lax.scan(step, terms.start(), factors_of(1, degree, v.dtype))[1], unpack(Spans, packed).normal
 
 
 moments.defjvp(_moments_jvp, symbolic_zeros=True)
@@ -143,6 +144,6 @@ def at_vertices(span: Spans, middle: Array, chord: Array) -> tuple[Array, Array]
     return middle - chord, middle + chord
 
 
-def speeds(spans: Spans, dv: Loop) -> tuple[Array, Array]:
-    """theta n . velocity of both ends of every edge, [e, p]."""
-    return dot(spans.normal, dv), dot(spans.normal, jnp.roll(dv, -1, 1))
+def speeds(normal: Loop, dv: Loop) -> tuple[Array, Array]:
+    """Of theta n of every edge: its products with the velocities of both ends, [e, p]."""
+    return dot(normal, dv), dot(normal, jnp.roll(dv, -1, 1))

@@ -114,8 +114,8 @@ def _fold_jvp(degree, spare, primals, tangents):
         turned = jax.jvp(lambda a: moments(a, v, degree), (axes,), (d_axes,))[1]
         change += _sum_all(turned * _by_degree(weights))
     if not isinstance(dv, SymbolicZero):
-        weights_of_ends = in_lanes(functools.partial(_fold_boundaries, degree=degree), (weights, v), (axes,))
-        for speed, weight in zip(speeds(unpack(Spans, spans_of(v)), dv), weights_of_ends, strict=True):
+        *weights_of_ends, normal = in_lanes(functools.partial(_fold_boundaries, degree=degree), (weights, v), (axes,))
+        for speed, weight in zip(speeds(normal, dv), weights_of_ends, strict=True):
             change -= sum_first(speed * weight)
     return value, change
 
@@ -123,8 +123,9 @@ def _fold_jvp(degree, spare, primals, tangents):
 _fold.defjvp(_fold_jvp, symbolic_zeros=True)
 
 
-def _fold_boundaries(weights: Array, v: Loop, axes: Array, degree: int) -> tuple[Array, Array]:
-    return _fold_boundary(weights, axes, spans_of(v), degree)
+def _fold_boundaries(weights: Array, v: Loop, axes: Array, degree: int) -> tuple[Array, Array, Loop]:
+    spans = spans_of(v)
+    return *_fold_boundary(weights, axes, spans, degree), unpack(Spans, spans).normal
 
 
 @functools.partial(jax.jit, static_argnames="degree")

@@ -11,13 +11,11 @@ only they are turned to the local frame.
 """
 
 import functools
-import math
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from shisd import _checks
 from shisd._lanes import in_lanes
@@ -28,14 +26,13 @@ from shisd.domains.internal import (
     clip,
     fold_expansion,
     loop_coefficients,
-    loop_solid_angle,
     on_sphere,
     zonal_inverse,
 )
 from shisd.harmonics.internal import product_matrices, rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models.internal import facing
-from shisd.shading._incidence import incidence_integrals
+from shisd.shading._incidence import Y_00, angle_above, incidence_integrals
 from shisd.shading._material import LocalForms, local_forms
 from shisd.shading._tiles import shade_tiles, stacked, sum_lights
 from shisd.shading._transformed_integrals import integrals, tables_of
@@ -46,7 +43,6 @@ from shisd.shading.slices._transformed import TransformedSlices, dense_views
 Light = PolygonLight | PortalLight
 _TILE = 256  # pixels at a time
 SMALL_TILE = 128  # where every pixel holds the moments about all axes
-Y_00 = math.sqrt(1 / (4 * math.pi))
 
 
 @eqx.filter_jit
@@ -114,7 +110,7 @@ def _integrals(slices: Slices | TransformedSlices) -> Callable[[Array, Loop, int
 
 def _uniform(slices: Slices, table: Array, local: Array, v: Loop, spare: int) -> Float[Array, "*colour p"]:
     """Integrals of plain slices."""
-    angle = loop_solid_angle(v, 2 * np.pi, _up(v))
+    angle = angle_above(v)
     if slices.isotropic:
         constant, of_colours = table[..., 0, :] @ lookup_factors(local, slices), table
         of_one = lambda t: incidence_integrals(t, local, v, slices.degree, spare)
@@ -134,14 +130,10 @@ def _directional(
     c, v = slice_values(table, local, slices), on_sphere(clip(outline, outline[2]))
     to_local = jnp.swapaxes(frame, 1, 2)
     world = _in_frame(to_local, v)
-    seen = through(product, world, loop_solid_angle(v, 2 * np.pi, _up(v))).reshape(-1, c.shape[-2], v.shape[2])
+    seen = through(product, world, angle_above(v)).reshape(-1, c.shape[-2], v.shape[2])
     seen = rotate_many(jnp.moveaxis(seen, 0, 1), to_local, slices.degree, slices.isotropic)
     seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *c.shape[-2:])
     return jnp.sum(times(c, seen), axis=-2)
-
-
-def _up(v: Loop) -> Float[Array, "3 p"]:
-    return jnp.broadcast_to(jnp.asarray([0, 0, 1], v.dtype)[:, None], (3, v.shape[2]))
 
 
 def _in_frame(frame: Float[Array, "p 3 3"], v: Loop) -> Loop:

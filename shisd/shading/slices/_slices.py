@@ -19,7 +19,22 @@ from shisd.shading.slices import _energies
 from shisd.shading.slices._upper import RIDGE, fit_above
 
 
-class Slices(Module):
+class Tabulated(Module):
+    """Coefficients [*colour, V, n] by view, or [*colour, V, A, n] of anisotropic materials."""
+
+    coefficients: eqx.AbstractVar[Array]
+    isotropic: eqx.AbstractVar[bool]
+
+    @property
+    def degree(self) -> int:
+        return _checks.degree_of(self.coefficients.shape[-1])
+
+    @property
+    def colour(self) -> tuple[int, ...]:
+        return self.coefficients.shape[: -2 if self.isotropic else -3]
+
+
+class Slices(Tabulated):
     """SH coefficients of a material's cosine-weighted slices, tabulated over local view directions (ISD15 Eq. 21).
 
     Arguments: `coefficients` [*colour, V, (L+1)^2] for isotropic materials, in views at elevations (j + 1/2) (pi/2)/V
@@ -51,14 +66,6 @@ class Slices(Module):
         check_domain(domain)
         self.coefficients, self.isotropic, self.domain = c, bool(isotropic), domain
         self.error = jnp.asarray(error, c.dtype)
-
-    @property
-    def degree(self) -> int:
-        return _checks.degree_of(self.coefficients.shape[-1])
-
-    @property
-    def colour(self) -> tuple[int, ...]:
-        return self.coefficients.shape[: -2 if self.isotropic else -3]
 
     @method
     def at(self, view: Float[Array, "3"]) -> Float[Array, "*colour n"]:

@@ -154,10 +154,7 @@ def slices_at(
     progress: Progress = None,
 ) -> tuple[Float[Array, "*colour_views n"], Scalar]:
     """SH coefficients of the slices at elevations `theta` of the view, and the quadrature's error in the worst norm."""
-    phi = np.zeros(1) if brdf.isotropic else 2 * np.pi * np.arange(azimuths) / azimuths
-    grid = np.meshgrid(theta, phi, indexing="ij")
-    sine, cosine = np.sin(grid[0]), np.cos(grid[0])
-    local = np.stack([sine * np.cos(grid[1]), sine * np.sin(grid[1]), cosine], axis=-1).astype(dtype)  # [V, A, 3]
+    local = view_grid(theta, azimuths, brdf.isotropic).astype(dtype)
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(brdf))
     project = lambda views: _project(brdf, views, degree, quadrature, norms)
     if progress is None or traced:
@@ -171,6 +168,14 @@ def slices_at(
         c, changes = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     shares = np.sin(2 * theta) * np.abs(np.gradient(theta))  # of a sphere's picture
     return _as_table(c, changes, jnp.asarray(shares, dtype), brdf.isotropic)
+
+
+def view_grid(theta: np.ndarray, azimuths: int, isotropic: bool) -> np.ndarray:
+    """Local views [V, A, 3] at these elevations; A = 1 of isotropic materials."""
+    phi = np.zeros(1) if isotropic else 2 * np.pi * np.arange(azimuths) / azimuths
+    grid = np.meshgrid(theta, phi, indexing="ij")
+    sine, cosine = np.sin(grid[0]), np.cos(grid[0])
+    return np.stack([sine * np.cos(grid[1]), sine * np.sin(grid[1]), cosine], axis=-1)
 
 
 @eqx.filter_jit
@@ -221,7 +226,7 @@ def project_slice(
     brdf: AbstractBrdf, view: Float[Array, "3"], width: Scalar, degree: int, quadrature: int
 ) -> Float[Array, "*colour n"]:
     """SH coefficients of w -> value_cosine(w, view), bands 0 ... degree."""
-    w, weight = _nodes(view, width, quadrature, half=brdf.isotropic)
+    w, weight = slice_nodes(view, width, quadrature, half=brdf.isotropic)
     values = jax.vmap(lambda wi: brdf.value_cosine(wi, view))(w)  # [nodes, *colour]
     values *= weight.reshape(-1, *(1,) * (values.ndim - 1))
     c = weighted_sums(values, w, degree)
@@ -229,7 +234,7 @@ def project_slice(
     return jnp.where(orders(degree) >= 0, c, 0) if brdf.isotropic else c
 
 
-def _nodes(
+def slice_nodes(
     view: Float[Array, "3"], width: Scalar, quadrature: int, *, half: bool
 ) -> tuple[Float[Array, "nodes 3"], Float[Array, " nodes"]]:
     """Directions above the horizon and their solid angles, graded towards the mirror direction of `view`.

@@ -13,20 +13,19 @@ import numpy as np
 
 from shisd import _checks
 from shisd._methods import method
-from shisd._module import Module
 from shisd._numerics import normalize
 from shisd._typing import Array, ArrayLike, Float, Scalar
 from shisd.decomposition import TransformedExpansion
 from shisd.decomposition.internal import Setting, moments_starts, project_beyond, search, stretch
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
-from shisd.shading.slices._slices import Slices, lookup_table, slice_values
-from shisd.shading.slices._tabulate import _nodes as nodes
+from shisd.shading.slices._slices import Slices, Tabulated, lookup_table, slice_values
+from shisd.shading.slices._tabulate import slice_nodes, view_grid
 
 BASE = 2  # degree of the plain harmonics under lobes
 
 
-class TransformedSlices(Module):
+class TransformedSlices(Tabulated):
     """Cosine-weighted slices as expansions of low degree beyond maps of directions, above the horizon, by view.
 
     Arguments: `maps` [V, 5], `coefficients` [*colour, V, (L+1)^2] beyond them and `base` [*colour, V, 9] of plain
@@ -66,14 +65,6 @@ class TransformedSlices(Module):
         self.maps, self.coefficients, self.base = m.astype(c.dtype), c, b.astype(c.dtype)
         self.isotropic = bool(isotropic)
         self.errors = jnp.broadcast_to(jnp.asarray(errors, c.dtype), c.shape[:-1])
-
-    @property
-    def degree(self) -> int:
-        return _checks.degree_of(self.coefficients.shape[-1])
-
-    @property
-    def colour(self) -> tuple[int, ...]:
-        return self.coefficients.shape[: -2 if self.isotropic else -3]
 
     @method
     def at(self, view: ArrayLike) -> TransformedExpansion:
@@ -152,7 +143,7 @@ def _transformed(
     width = jnp.asarray(jax.lax.stop_gradient(brdf.lobe_width), dtype)
 
     def samples(view: Float[Array, "3"]) -> tuple[Array, Array, Array, Scalar]:
-        w, areas = nodes(view, width, quadrature, half=brdf.isotropic)
+        w, areas = slice_nodes(view, width, quadrature, half=brdf.isotropic)
         values = jax.vmap(lambda wi: brdf.value_cosine(wi, view))(w)
         firm = ridge * (1 + _GRAZING / view[2] ** 2)  # half of a grazing lobe is below the horizon, and not seen
         return w, jnp.moveaxis(values, 0, -1), areas, firm
@@ -162,9 +153,8 @@ def _transformed(
             s, _ = search(before[None], *samples(view), setting)
             return s, s
 
-        w, y, areas, _ = samples(views[-1])
-        mass = jnp.sum(jnp.abs(y.reshape(-1, len(w))), axis=0) * areas
-        return jax.lax.scan(step, moments_starts(w, mass, setting.even)[1], views, reverse=True)[1]
+        first = moments_starts(*samples(views[-1])[:3], setting.even)[1]
+        return jax.lax.scan(step, first, views, reverse=True)[1]
 
     at = _grid(_SEARCHED, _SEARCHED, brdf.isotropic, dtype)
     searched = jax.lax.map(from_horizon, jnp.moveaxis(at, 1, 0))  # [A, V, 5]
@@ -186,8 +176,5 @@ def _transformed(
 
 def _grid(elevations: int, azimuths: int, isotropic: bool, dtype: jnp.dtype) -> Float[Array, "v a 3"]:
     """Local view directions at the nodes of tables."""
-    phi = np.zeros(1) if isotropic else 2 * np.pi * np.arange(azimuths) / azimuths
-    theta = np.meshgrid(_views.elevations(elevations), phi, indexing="ij")
-    sine = np.sin(theta[0])
-    views = np.stack([sine * np.cos(theta[1]), sine * np.sin(theta[1]), np.cos(theta[0]) / _DENSER], axis=-1)
+    views = view_grid(_views.elevations(elevations), azimuths, isotropic) / [1, 1, _DENSER]
     return jnp.asarray(views / np.linalg.norm(views, axis=-1, keepdims=True), dtype)
