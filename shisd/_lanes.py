@@ -25,8 +25,9 @@ _TAG = {"xla_cpu_small_call": "true", "inlineable": "false"}
 def in_lanes(function: Callable[..., Result], arrays: tuple[Array, ...], shared: tuple[Array, ...] = ()) -> Result:
     """function(*arrays, *shared) of arrays [..., p or 1], for every p apart; under `vmap` its batch goes along with p.
 
-    Results are arrays [..., p]. `function` has no products of matrices and no sums over an axis, which the kernel does
-    not allow. Where `shared` has a batch, and in derivatives of `function`, `vmap` does as it always does.
+    So are results. `function` takes any mixture of p and 1, for a batch of some arrays makes a mixture of ones. It has
+    no products of matrices and no sums over an axis, which the kernel does not allow. Where `shared` has a batch, and
+    in derivatives of `function`, `vmap` does as it always does.
     """
     own = len(arrays)
     lanes = custom_vmap(lambda *inputs: _in_chunks(function, inputs[:own], inputs[own:]))
@@ -44,8 +45,12 @@ def in_lanes(function: Callable[..., Result], arrays: tuple[Array, ...], shared:
             a = jnp.moveaxis(a, 0, -2) if has_batch else jnp.broadcast_to(a[..., None, :], (*a.shape[:-1], size, count))
             return jnp.broadcast_to(a, (*a.shape[:-1], count)).reshape(*a.shape[:-2], size * count)
 
+        def gathered(a: Array) -> Array:
+            a = jnp.broadcast_to(a, (*a.shape[:-1], size * count))
+            return jnp.moveaxis(a.reshape(*a.shape[:-1], size, count), -2, 0)
+
         result = lanes(*(spread(a, b) for a, b in zip(inputs[:own], batched, strict=False)), *inputs[own:])
-        return everywhere(jax.tree.map(lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], size, count), -2, 0), result))
+        return everywhere(jax.tree.map(gathered, result))
 
     call = jax.custom_jvp(lambda *inputs: lanes(*inputs))
     call.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))

@@ -285,7 +285,13 @@ CASES = [
         heavy=True,
         idle=("*",),
     ),
-    Case("decomposition.TransformedExpansion.directions", lambda f, w: f.directions(w), lambda: (beyond(), W), (1,)),
+    Case(
+        "decomposition.TransformedExpansion.directions",
+        lambda f, w: f.directions(w),
+        lambda: (beyond(), W),
+        (1,),
+        idle=("coefficients",),
+    ),
     Case("decomposition.TransformedExpansion.evaluate", lambda f, w: f.evaluate(w), lambda: (beyond(), W)),
     Case(
         "decomposition.fit_transformed",

@@ -1,5 +1,7 @@
 """Batches in vector lanes: one kernel or plain code, by `vmap` or not, the values and derivatives are the same."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,10 @@ import pytest
 
 from shisd import _lanes
 from shisd._lanes import LANES, in_lanes
+from shisd.domains._polygon import loop_solid_angle
+from shisd.domains.moments._fold import fold
+from shisd.shading import _transformed_integrals
+from tests.hard_cases import ring
 
 
 @pytest.fixture(params=["one kernel", "plain"])
@@ -73,6 +79,31 @@ def test_batches_of_vmap_are_points(kernel, rng):
     rows = (0.5 * rng.normal(size=(70, 5, 3))).astype(np.float32)
     want = [np.stack(w) for w in zip(*(expected(x[0], y, a) for a in rows), strict=True)]
     close(jax.jit(jax.vmap(run, in_axes=(None, None, 0)))(x[0], y, rows), want, np.float32)
+
+
+RNG = np.random.default_rng(3)
+TURNS = np.linalg.qr(RNG.normal(size=(4, 3, 3)))[0].astype(np.float32)
+LOOPS = (TURNS @ ring(range(5), 1.0).T.astype(np.float32))[..., None]
+WEIGHTS, FORMS = (RNG.normal(size=(4, *shape, 1)).astype(np.float32) for shape in ((3, 4), (5,)))
+maps = functools.partial(_transformed_integrals._mapped, even=False)
+
+
+@pytest.mark.parametrize(
+    ("run", "arguments"),
+    [
+        (lambda w, v: fold(w, jnp.asarray(TURNS[0]), v, 3), (WEIGHTS, LOOPS)),
+        (lambda v, up: loop_solid_angle(v, 2 * np.pi, up), (LOOPS, TURNS[..., :1])),
+        (lambda s, v: in_lanes(maps, (s, v)), (FORMS, LOOPS)),
+    ],
+    ids=["fold", "solid angle", "maps"],
+)
+def test_a_batch_of_one_array_of_one_point(run, arguments):
+    for i in range(2):
+        given = [jnp.asarray(a if n == i else a[0]) for n, a in enumerate(arguments)]
+        got = jax.vmap(run, [0 if n == i else None for n in range(2)])(*given)
+        want = [run(*(jnp.asarray(a[k if n == i else 0]) for n, a in enumerate(arguments))) for k in range(4)]
+        for g, *w in zip(jax.tree.leaves(got), *map(jax.tree.leaves, want), strict=True):
+            np.testing.assert_allclose(g, np.stack(w), rtol=2e-6, atol=1e-6)
 
 
 def test_derivatives_by_both_modes_and_their_own(kernel, x64, rng):

@@ -171,7 +171,9 @@ def _solid_angle(polygon: SphericalPolygon) -> Float[Array, "*batch"]:
     return for_each(lambda one: loop_solid_angle(one.loop(), one.largest)[0], polygon)
 
 
-def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | None = None) -> Float[Array, " p"]:
+def loop_solid_angle(
+    v: Float[Array, "3 s r"], largest: float, fallback: Float[Array, "3 q"] | None = None
+) -> Float[Array, " p"]:
     """Solid angles of loops, in (largest - 4 pi, largest] up to rounding.
 
     The fan starts at the first vertex, or where another is nearly opposite, at `fallback`: where it is given, it is a
@@ -180,7 +182,9 @@ def loop_solid_angle(v: Loop, largest: float, fallback: Float[Array, "3 p"] | No
     return in_lanes(functools.partial(_fan, largest=largest), (v,) if fallback is None else (v, fallback))
 
 
-def _fan(v: Loop, fallback: Float[Array, "3 p"] | None = None, *, largest: float) -> Float[Array, " p"]:
+def _fan(
+    v: Float[Array, "3 s r"], fallback: Float[Array, "3 q"] | None = None, *, largest: float
+) -> Float[Array, " p"]:
     first = jax.lax.stop_gradient(v[:, 0])
     risky = functools.reduce(jnp.minimum, list(dot(v, first[:, None]))) < -0.9
     other = _far_from_opposites(jax.lax.stop_gradient(v)) if fallback is None else jax.lax.stop_gradient(fallback)

@@ -88,7 +88,7 @@ def _of_map(
     return of_colour((lobes[0], base[0]))[None] if len(lobes) == 1 else jax.lax.map(of_colour, (lobes, base))
 
 
-def _mapped(s: Float[Array, "5 p"], v: Loop, *, even: bool) -> tuple[Loop, Float[Array, "3 p"]]:
+def _mapped(s: Float[Array, "5 q"], v: Float[Array, "3 s r"], *, even: bool) -> tuple[Loop, Float[Array, "3 q"]]:
     """The outline beyond the map, and there a direction from which all of it is within a quarter turn: A^-T z."""
     a = stretch(s, even=even)
     mapped = on_sphere(jnp.stack([dot(row[:, None], v) for row in a]))

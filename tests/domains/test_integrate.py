@@ -99,7 +99,7 @@ def many(rng):
     return v, expected, rng.normal(size=25).astype(np.float32)
 
 
-near = functools.partial(np.testing.assert_allclose, atol=2e-5, rtol=0)
+near = functools.partial(np.testing.assert_allclose, atol=5e-6, rtol=0)
 
 
 def test_one_expansion_over_many_polygons(many):

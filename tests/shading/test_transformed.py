@@ -79,7 +79,7 @@ def test_integrals_are_exact(isotropic, dtype, rng):
         want = expected(random_slices(np.float64, isotropic), LAMP, *geometry)
     got = radiance(random_slices(dtype, isotropic), *(a.astype(dtype) for a in (LAMP, *geometry)))
     assert got.dtype == dtype and got[5] == 0 and np.min(np.abs(want[:5])) > 1e-3
-    np.testing.assert_allclose(got, want, rtol=0, atol=(1e-5 if dtype == np.float32 else 1e-12) * np.max(np.abs(want)))
+    np.testing.assert_allclose(got, want, rtol=0, atol=(1e-6 if dtype == np.float32 else 3e-15) * np.max(np.abs(want)))
 
 
 @pytest.mark.parametrize("isotropic", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -109,7 +109,7 @@ def test_derivatives_in_everything(isotropic, x64, rng):
         parts = [np.sum(np.asarray(g) * m) for g, m in zip(*map(jax.tree.leaves, (gradient, move)), strict=True)]
         if i == 0:
             parts = parts[:3]  # errors have no part in radiance
-        np.testing.assert_allclose(sum(parts), want, atol=2e-6 * (1 + abs(want)), err_msg=str(i))
+        np.testing.assert_allclose(sum(parts), want, atol=1e-8 * (1 + abs(want)), err_msg=str(i))
 
 
 def test_views_are_looked_up_at_their_nodes(dtype):
@@ -118,7 +118,7 @@ def test_views_are_looked_up_at_their_nodes(dtype):
     theta = (np.arange(VIEWS) + 0.5) * np.pi / (2 * VIEWS)
     for j in (0, 3, VIEWS - 1):
         lobe = slices.at(unit(np.array([np.sin(theta[j]), 0, np.cos(theta[j]) / 3])).astype(dtype))
-        error = 3e-6 if dtype == np.float32 else 1e-13
+        error = 2e-6 if dtype == np.float32 else 1e-14
         np.testing.assert_allclose(lobe.coefficients, slices.coefficients[:, j], atol=error)
         np.testing.assert_allclose(lobe.base, slices.base[:, j], atol=error)
         turned = slices.at(unit(np.array([0, np.sin(theta[j]), np.cos(theta[j]) / 3])).astype(dtype))
@@ -157,22 +157,28 @@ def made(alpha, degree):
     return shading.transform_brdf(models.Ggx(np.float32(alpha), np.float32([1, 0, 0.5])), degree)
 
 
+MEASURED = {  # of the slices for F = 1, at 60, 75 and 85 degrees
+    (0.02, 4): (3e-4, 1.1e-3, 8.8e-3), (0.05, 4): (1.2e-3, 5.9e-3, 3.3e-2), (0.1, 4): (4.5e-3, 1.6e-2, 6.5e-2),
+    (0.25, 4): (9.3e-3, 3.0e-2, 7.1e-2), (0.5, 4): (6.5e-3, 1.5e-2, 3.0e-2),
+    (0.02, 8): (2e-4, 5e-4, 3.6e-3), (0.05, 8): (6e-4, 1.9e-3, 2.0e-2), (0.1, 8): (1.3e-3, 3.6e-3, 2.2e-2),
+    (0.25, 8): (1.4e-3, 6.1e-3, 2.4e-2), (0.5, 8): (1.2e-3, 3.6e-3, 1.2e-2),
+}  # fmt: skip
+NEEDED = {4: (1.5e-2, 5e-2, 1e-1), 8: (2.5e-3, 1.3e-2, 4.5e-2)}
+
+
 @pytest.mark.parametrize(
-    ("alpha", "degree"),
-    [
-        pytest.param(alpha, degree, marks=() if (alpha, degree) == (0.1, 4) else pytest.mark.slow)
-        for alpha in (0.02, 0.05, 0.1, 0.25, 0.5)
-        for degree in (4, 8)
-    ],
+    ("alpha", "degree"), [pytest.param(*e, marks=() if e == (0.1, 4) else pytest.mark.slow) for e in MEASURED]
 )
 def test_slices_of_ggx_between_the_nodes(alpha, degree):
-    """For F = 1 and the Fresnel term of Schlick, over the norm for F = 1; measured at most 0.62 of these limits."""
+    """For F = 1 and the Fresnel term of Schlick, over the norm for F = 1."""
     slices, brdf = made(alpha, degree), models.Ggx(np.float32(alpha))
-    limits = {4: (1.5e-2, 1.5e-2, 5e-2, 1e-1), 8: (2.5e-3, 2.5e-3, 1.3e-2, 4.5e-2)}[degree]
-    for theta, limit in zip((20.3, 60, 75, 85), limits, strict=True):
+    limits = [
+        min(1.5 * measured, needed) for measured, needed in zip(MEASURED[alpha, degree], NEEDED[degree], strict=True)
+    ]
+    for theta, limit in zip((20.3, 60, 75, 85), (limits[0], *limits), strict=True):
         assert max(slice_error(slices, brdf, np.radians(theta))) < limit, theta
     assert max(slice_error(slices, brdf, np.radians(89.9))) < 0.25
-    assert np.max(np.asarray(slices.errors)[0, :21]) < limits[1]
+    assert np.max(np.asarray(slices.errors)[0, :21]) < limits[0]
 
 
 @pytest.mark.slow

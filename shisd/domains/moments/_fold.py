@@ -23,14 +23,14 @@ _OPERATIONS = 1600  # in one kernel: without the limit a lamp at degree 8 takes 
 
 
 def fold(
-    weights: Float[Array, "k l q"], axes: Float[Array, "k 3"], v: Loop, degree: int, spare: int = 0
+    weights: Float[Array, "k l q"], axes: Float[Array, "k 3"], v: Float[Array, "3 s r"], degree: int, spare: int = 0
 ) -> Float[Array, " p"]:
-    """sum over k and l >= 1 of weights[k, l] l (l+1) I_l(axes[k]) for every polygon. Weights may be shared (q = 1).
+    """sum over k and l >= 1 of weights[k, l] l (l+1) I_l(axes[k]) for every polygon. Weights or loops may be shared.
 
     The last `spare` edges cost time only if one of them has a length, in any polygon.
     """
     if degree == 0:
-        return jnp.zeros(v.shape[2:], v.dtype)
+        return _zero(weights, v)
     if _edges_at_once(degree) > 0:
         return _fold(weights, axes, v, degree, spare)
     return _sum_all(moments(axes, v, degree) * _by_degree(weights))
@@ -43,11 +43,11 @@ def _by_degree(weights: Float[Array, "k l q"]) -> Float[Array, "bands k q"]:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
-def _fold(weights: Array, axes: Array, v: Loop, degree: int, spare: int) -> Float[Array, " p"]:
+def _fold(weights: Array, axes: Array, v: Float[Array, "3 s q"], degree: int, spare: int) -> Float[Array, " p"]:
     return in_lanes(functools.partial(_fold_loops, degree=degree, spare=spare), (weights, v), (axes,))
 
 
-def _fold_loops(weights: Array, v: Loop, axes: Array, degree: int, spare: int) -> Float[Array, " p"]:
+def _fold_loops(weights: Array, v: Float[Array, "3 s q"], axes: Array, degree: int, spare: int) -> Float[Array, " p"]:
     arcs = arcs_of(v)
     return _fold_edges(weights, axes, arcs.c, arcs.total, arcs.edges, degree, spare)
 
@@ -81,7 +81,7 @@ def _fold_edges(
 
         return _for_axes(axis, value, axes, weights)
 
-    value = jnp.zeros_like(total[0])
+    value = _zero(weights, total)
     usual = edges.shape[1] - spare
     size = math.ceil(usual / math.ceil(usual / _edges_at_once(degree)))
     groups = math.ceil(usual / size) + math.ceil(spare / size)
@@ -123,7 +123,7 @@ def _fold_jvp(degree, spare, primals, tangents):
 _fold.defjvp(_fold_jvp, symbolic_zeros=True)
 
 
-def _fold_boundaries(weights: Array, v: Loop, axes: Array, degree: int) -> tuple[Array, Array, Loop]:
+def _fold_boundaries(weights: Array, v: Float[Array, "3 s q"], axes: Array, degree: int) -> tuple[Array, Array, Loop]:
     spans = spans_of(v)
     return *_fold_boundary(weights, axes, spans, degree), unpack(Spans, spans).normal
 
@@ -135,7 +135,7 @@ def _fold_boundary(weights: Array, axes: Array, spans: Float[Array, "rows e p"],
     Both sums are the parts of one complex number, and so come out of one loop.
     """
     factors = factors_of(1, degree, spans.dtype)
-    zero = jnp.zeros_like(spans[0, 0])
+    zero = _zero(weights, spans)
 
     def edge(span: Float[Array, "rows p"]) -> Array:
         def axis(total: Array, d: Array, w: Array) -> Array:
@@ -155,6 +155,10 @@ def _fold_boundary(weights: Array, axes: Array, spans: Float[Array, "rows e p"],
 
     sums = jax.lax.map(edge_if_any, jnp.moveaxis(spans, 1, 0))
     return at_vertices(unpack(Spans, spans), sums.real, sums.imag)
+
+
+def _zero(weights: Array, points: Array) -> Float[Array, " p"]:
+    return jnp.zeros(np.broadcast_shapes(weights.shape[-1:], points.shape[-1:]), points.dtype)
 
 
 def _for_axes(body: Callable, value: Value, axes: Array, weights: Array) -> Value:
