@@ -577,6 +577,21 @@ CASES = [
         idle=("error",),
     ),
     Case(
+        "shading.shade Quadrature",
+        shading.shade,
+        lambda: (shading.Quadrature(models.Ggx(np.float32(0.4), np.float32([0.3, 0.6, 1])), 2), portal(), placed()),
+        (2,),
+        heavy=True,
+    ),
+    Case(
+        "shading.shade TransformedSlices",
+        shading.shade,
+        lambda: (stretched(), [panel(), ball()], placed()),
+        (2,),
+        heavy=True,
+        idle=("errors",),
+    ),
+    Case(
         "shading.shade several",
         shading.shade,
         lambda: (material(), [distant(), ball(), panel(), distant()], seen(POSITIONS, mask=np.arange(N) != 1)),

@@ -9,9 +9,10 @@ import pytest
 from jax.test_util import check_grads
 
 from shisd import Status, harmonics, models, planning, reference, shading
-from shisd.planning._bands import Distant, Material, known_light
-from shisd.planning._paths import Table
-from shisd.planning._prediction import judge, predict
+from shisd.planning._bands import Distant, Material, known_light, known_material, predict
+from shisd.planning._choice import _first
+from shisd.planning._paths import Points, Polygon, Table
+from shisd.planning._prediction import judge
 from tests.hard_cases import unit
 
 LAMP = np.array([[-0.5, -0.5, 1.5], [-0.5, 0.5, 1.5], [0.5, 0.5, 1.5], [0.5, -0.5, 1.5]], np.float32)
@@ -92,8 +93,11 @@ def test_the_cheapest_valid_path_is_found():
     assert chosen["clay", "room"].path == chosen["clay", "sky"].path == "irradiance"
     assert chosen["satin", "room"].path == "isotropic table"
     assert chosen["satin", "sky"].joined == "room" and chosen["satin", "sky"].cost == 0
-    assert chosen["satin", "lamp"].path == "polygon"
-    assert chosen["clay", "lamp"].degree == 1  # the cosine above the horizon, where the fit is
+    assert chosen["satin", "lamp"].path == chosen["clay", "lamp"].path == "points"
+    clay = known_material(MATERIALS["clay"], MAX_DEGREE, 4)
+    lamp = known_light("lamp", scene().lights["lamp"], scene().points, MAX_DEGREE)
+    by_slices = _first(Polygon, clay, lamp, 0.02, MAX_DEGREE)
+    assert by_slices.degree == 1  # the cosine above the horizon, where the fit is
     text = str(planned())
     assert all(word in text for word in ("visibility", "irradiance", "isotropic table", "added to room"))
 
@@ -172,7 +176,7 @@ def test_errors_are_those_of_the_worst_colour(rng):
     light = Distant(e, True)
     energy = shares @ np.add.reduceat(slices[0] ** 2, np.arange(7) ** 2, axis=-1)
     red = energy * [1, 0, 0, 0, 0, 0, 13] / (2 * np.arange(7) + 1)
-    material = Material(slices, shares, False, True, 4)
+    material = Material(slices, shares, False, True, 4, MATERIALS["clay"])
     for degree, expected in ((5, np.sqrt(red[6] / np.sum(red))), (6, 0.0)):
         np.testing.assert_allclose(judge(Table, material, light, degree).error, expected, rtol=1e-12)
 
@@ -184,6 +188,20 @@ def test_what_cannot_be_met_is_said():
     assert made.status == Status.tolerance_not_met and made.entries[0].degree == 3 and "NOT MET" in str(made)
     with pytest.raises(ValueError, match="is not met at degree 3"):
         planning.plan(alone, 1e-3, max_degree=3)
+
+
+def test_points_are_chosen_where_they_are_cheapest(rng):
+    """Under a lamp, of a wide lobe; of one so narrow that it lies between them, they know nothing."""
+    lamp = models.PolygonLight(LAMP, np.float32(2))
+    made = planning.plan(planning.Scene({"it": models.Ggx(0.5)}, {"lamp": lamp}, scene().points), 0.03, max_degree=4)
+    (entry,) = made.entries
+    assert entry.path == "points" and made.status == Status.ok
+    where = pixels(rng, 2000)
+    truth = reference.shade_polygon_quadrature(models.Ggx(0.5), LAMP, lamp.emission, *where)
+    error = np.sqrt(np.mean((made.shade("it", surface(*where)) - truth) ** 2) / np.mean(np.square(truth)))
+    assert 0.6 < error / entry.error < 1.6 and error < 0.03
+    mirror = known_material(models.Ggx(0.001), 16, 4)
+    assert judge(Points, mirror, known_light("lamp", lamp, scene().points, 16), 16).error > 1
 
 
 @pytest.mark.slow

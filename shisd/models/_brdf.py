@@ -7,6 +7,7 @@ G1(o) / cos_o = 2 / (cos_o + sqrt(cos_o^2 + alpha^2 sin_o^2)), so that nothing i
 """
 
 import abc
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, TypeVar, final
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 
 from shisd import _checks
 from shisd._module import Module
-from shisd._numerics import normalize, safe_sqrt
+from shisd._numerics import safe_sqrt
 from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar, Vector
 
 Colour = Float[Array, "..."]  # () or (3,); the parameters of one model may mix both
@@ -100,14 +101,18 @@ def above_horizon(
             raise ValueError(f"`{name}` must have shape [3]; got {shape}. Use jax.vmap for batches.")
     dtype = max(wi.dtype, wo.dtype, key=lambda d: d.itemsize)
     wi, wo = wi.astype(dtype), wo.astype(dtype)
-    inputs = [wi, wo, *jax.tree.leaves(model)]
+    fields = jax.tree.leaves(model)
     bounded = [(getattr(model, name), least) for name, least in getattr(model, "least", {}).items()]
-    good = [jnp.all(jnp.isfinite(a)) for a in inputs] + [jnp.all(a >= b) for a, b in bounded if a is not None]
-    nothing = jnp.where(jnp.all(jnp.stack(good)), jnp.zeros((), dtype), jnp.nan)
-    elsewhere = jnp.sum(jnp.stack([jnp.sum(nothing * a.astype(dtype)) for a in inputs]))
-    above = (wi[2] > 0) & (wo[2] > 0) & ~jnp.isnan(nothing)
-    normal = jnp.array([0, 0, 1], dtype)
-    return jnp.where(above, wi, normal), jnp.where(above, wo, normal), above, elsewhere
+    good = [jnp.isfinite(x) for direction in (wi, wo) for x in direction] + [jnp.all(jnp.isfinite(a)) for a in fields]
+    good += [jnp.all(a >= b) for a, b in bounded if a is not None]
+    good = functools.reduce(jnp.logical_and, good)
+    tiny = jnp.finfo(dtype).tiny  # times it nothing overflows, and NaN is NaN
+    marks = [x for direction in (wi, wo) for x in direction] + [jnp.sum(a.astype(dtype) * tiny) for a in fields]
+    elsewhere = jnp.where(good, 0, jnp.nan).astype(dtype) * functools.reduce(jnp.add, marks)
+    above = (wi[2] > 0) & (wo[2] > 0) & good
+    # component by component, here and below: `Ggx` at 16,384 points takes 12 ns each so, 54 as vectors (jax 0.10.2)
+    here = lambda d: jnp.stack([jnp.where(above, x, n).astype(dtype) for x, n in zip(d, (0, 0, 1), strict=True)])
+    return here(wi), here(wo), above, elsewhere
 
 
 def cast(model: Pytree, dtype: DTypeLike) -> Pytree:
@@ -117,9 +122,12 @@ def cast(model: Pytree, dtype: DTypeLike) -> Pytree:
 
 def half_vector(wi: Vector, wo: Vector) -> tuple[Vector, Scalar]:
     """The unit half vector h, and cos(theta_d) = wi.h = wo.h = |wi + wo| / 2."""
-    total = wi + wo
-    half = normalize(total)
-    return half, jnp.sum(total * half) / 2
+    total = [wi[i] + wo[i] for i in range(3)]
+    scale = jax.lax.stop_gradient(functools.reduce(jnp.maximum, [jnp.abs(x) for x in total]))
+    scaled = [x / scale for x in total]
+    length = jnp.sqrt(scaled[0] ** 2 + scaled[1] ** 2 + scaled[2] ** 2)
+    half = [x / length for x in scaled]
+    return jnp.stack(half), (total[0] * half[0] + total[1] * half[1] + total[2] * half[2]) / 2
 
 
 def schlick_fresnel(cosine: Scalar, f0: Colour) -> Colour:
@@ -153,7 +161,7 @@ def conductor_fresnel(cosine: Scalar, eta: Colour, k: Colour) -> Colour:
 
 def ggx_distribution(half: Vector, alpha_x: Scalar, alpha_y: Scalar) -> Scalar:
     """D(h) in 1/sr, with projected area one: integral of D(h) h.z dh = 1 (W07 Eq. 33, H14 Eq. 85)."""
-    x, y, z = half / jnp.stack([alpha_x, alpha_y, jnp.ones_like(alpha_x)])
+    x, y, z = half[0] / alpha_x, half[1] / alpha_y, half[2]
     return 1 / (math.pi * alpha_x * alpha_y * (x * x + y * y + z * z) ** 2)
 
 
@@ -203,8 +211,8 @@ class Phong(AbstractBrdf):
     def value(self, wi: ArrayLike, wo: ArrayLike) -> Colour:
         wi, wo, above, elsewhere = above_horizon(wi, wo, self)
         p = cast(self, wi.dtype)
-        chord = wi - wo * jnp.array([-1, -1, 1], wo.dtype)  # from the mirror direction to wi: r.wi = 1 - |chord|^2 / 2
-        versine = jnp.sum(chord * chord) / 2
+        x, y, z = wi[0] + wo[0], wi[1] + wo[1], wi[2] - wo[2]  # from the mirror direction r to wi
+        versine = (x * x + y * y + z * z) / 2  # 1 - r.wi
         inside = versine < 1
         power = jnp.where(inside, jnp.exp(p.exponent * jnp.log1p(-jnp.where(inside, versine, 0))), 0)
         lobe = p.specular * ((p.exponent + 2) / (2 * math.pi) * power)

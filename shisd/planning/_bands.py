@@ -31,6 +31,7 @@ class Material:
     coloured: bool
     isotropic: bool
     elevations: int  # of the tables to be made
+    brdf: AbstractBrdf  # itself, which points on lights are evaluated with
 
     @property
     def colours(self) -> int:
@@ -122,6 +123,7 @@ class Local:
     light: PolygonLight | PortalLight
     norms: np.ndarray
     light_degree: int
+    points: np.ndarray  # [P, 3]
 
     @property
     def kind(self) -> type:
@@ -148,7 +150,7 @@ def known_material(brdf: AbstractBrdf, degree: int, elevations: int) -> Material
     c = np.asarray(_slices(brdf, jnp.asarray(local, float), degree), float)  # [V, *colour, n]
     shares = np.repeat(weights, len(azimuths)) * np.sin(2 * theta)
     coefficients = np.moveaxis(c.reshape(len(theta), -1, c.shape[-1]), 0, 1)
-    return Material(coefficients, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, elevations)
+    return Material(coefficients, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, elevations, brdf)
 
 
 @eqx.filter_jit
@@ -165,7 +167,7 @@ def known_light(name: str, light: Light, points: Any, degree: int) -> Seen:
         outline = PolygonLight(light.points, two_sided=light.two_sided)
         seen = project_light(outline, points, degree + light_degree)
         received = multiply(seen[None], incident.reshape(-1, 1, incident.shape[-1]), degree)
-        found = Local(light, _norms(np.asarray(received, float)), light_degree)
+        found = Local(light, _norms(np.asarray(received, float)), light_degree, np.asarray(points))
     else:
         if isinstance(light, Environment):
             light = light.light(min(degree, light.texels.shape[0] - 1))
@@ -182,3 +184,15 @@ def _norms(coefficients: np.ndarray) -> np.ndarray:
     """Norms [..., l] of the bands."""
     starts = np.arange(_checks.degree_of(coefficients.shape[-1]) + 1) ** 2
     return np.sqrt(np.add.reduceat(coefficients**2, starts, axis=-1))
+
+
+def predict(slices: np.ndarray, lights: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """RMS of the product of slices and lights, and a bound on it, from norms of their bands [C, V, l] and [C, P, l].
+
+    One for each colour [C]. The RMS is over views by their `shares` [V], points, and all rotations between slices and
+    lights; the bound holds for the worst of the rotations.
+    """
+    energy = np.einsum("v,cvl->cl", shares, slices**2) * np.mean(lights**2, axis=1)
+    worst = slices @ np.swapaxes(lights, 1, 2)  # [C, V, P]
+    square = np.sum(energy / (2 * np.arange(slices.shape[-1]) + 1), axis=-1)
+    return np.sqrt(square), np.sqrt(np.mean(np.einsum("v,cvp->cp", shares, worst**2), axis=1))

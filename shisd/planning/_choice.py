@@ -30,9 +30,9 @@ class Entry(NamedTuple):
     material: str
     light: str
     path: str
-    degree: int
+    degree: int  # or the order of points
     error: float  # predicted RMS
-    bound: float  # on the RMS whatever way materials and lights are turned, from the same bands
+    bound: float  # on the RMS whatever way materials and lights are turned, from the same bands; of points, the worst
     cost: float  # multiply-adds per pixel; 0 for a light that joins another
     joined: str  # the light that it is added to before the path is taken, or ""
     met: bool
@@ -99,6 +99,8 @@ def plan(
     ways. `elevations` of the tables, as in `shading.tabulate_brdf`.
     Distant lights that take the same path are added up before it, so only the first of them costs anything, and others
     join where they meet the tolerance there.
+    Lamps and windows may take points on them (`shading.Quadrature`) in place of slices: `degree` of such an entry is
+    the order, its error what 1024 normals at every point show, against order 24, and `bound` the largest of them.
     Where nothing meets the tolerance, it is a ValueError; with `throw=False` the entry has the best that `max_degree`
     can do and `met` False, the `status` is `tolerance_not_met`, and a UserWarning says so. `progress`: None, True for a
     bar of tqdm, or a function of (done, total) lights and materials.
@@ -145,7 +147,8 @@ def _plan(
         material = known_material(brdf, reference, elevations)
         choices = {of: _choose(material, light, tolerance / margin, max_degree) for of, light in lights.items()}
         choices, hosts = _join(material, lights, choices, tolerance / margin)
-        slices = as_type(tabulate_brdf(brdf, max(c.degree for c in choices.values()), elevations=elevations), float)
+        needed = [choice.degree for choice in choices.values() if choice.path.expanded]
+        slices = as_type(tabulate_brdf(brdf, max(needed), elevations=elevations), float) if needed else None
         for of, choice in choices.items():
             alone = hosts[of] == of
             cost, joined = (choice.cost, "") if alone else (0.0, hosts[of])
@@ -167,10 +170,18 @@ def _choose(material: Material, light: Seen, target: float, max_degree: int) -> 
     found = []
     for path in PATHS:
         if path.takes is light.kind:
-            tries = (judge(path, material, light, degree) for degree in range(max_degree + 1))
-            found.append(next((t for t in tries if t.error <= target), judge(path, material, light, max_degree)))
+            found.append(_first(path, material, light, target, max_degree))
     good = [choice for choice in found if choice.error <= target]
     return min(good, key=lambda c: c.cost) if good else min(found, key=lambda c: c.error)
+
+
+def _first(path: type[Path], material: Material, light: Seen, target: float, max_degree: int) -> Choice:
+    """A path at the first degree that meets the target, or at the last."""
+    for degree in path.degrees(max_degree):
+        choice = judge(path, material, light, degree)
+        if choice.error <= target:
+            break
+    return choice
 
 
 def _join(

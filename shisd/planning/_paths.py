@@ -2,6 +2,7 @@
 
 import abc
 import functools
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -13,9 +14,14 @@ from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.harmonics import convolve, evaluate
 from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
-from shisd.planning._bands import Distant, Local, Material
-from shisd.shading import Slices, Surface, shade
+from shisd.planning._bands import Distant, Local, Material, predict
+from shisd.shading import Quadrature, Slices, Surface, shade
 from shisd.shading.internal import as_type, finite_mark, finite_or_nan, shade_points
+
+_ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
+_EXACT = 24  # the order that others are compared with
+_FACING = 1024  # normals
+_EVALUATION = 100  # of a model, in multiply-adds
 
 
 class Path(Module):
@@ -26,11 +32,17 @@ class Path(Module):
 
     name: ClassVar[str]
     takes: ClassVar[type]
+    expanded: ClassVar[bool] = True
 
     @staticmethod
+    def degrees(most: int) -> Iterable[int]:
+        """Those to try, from the cheapest."""
+        return range(most + 1)
+
+    @classmethod
     @abc.abstractmethod
-    def left_out(material: Material, light: Any, degree: int) -> tuple[np.ndarray, np.ndarray]:
-        """Band norms of slices [C, V, l] and lights [C, P, l] whose product is what the path leaves out."""
+    def errors(cls, material: Material, light: Any, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """RMS of what the path is off, a bound on it, and the RMS radiance, for each colour [C]."""
 
     @staticmethod
     @abc.abstractmethod
@@ -39,15 +51,29 @@ class Path(Module):
 
     @classmethod
     @abc.abstractmethod
-    def make(cls, material: Material, slices: Slices, lights: list, degree: int) -> "Path":
-        """The path, ready to be called; `slices` of this degree or a higher one."""
+    def make(cls, material: Material, slices: Any, lights: list, degree: int) -> "Path":
+        """The path, ready to be called; `slices`, of this degree or a higher one, if it is `expanded`."""
 
     @abc.abstractmethod
     def shade(self, surface: Surface) -> Array:
         """Radiance [..., *colour]."""
 
 
-class Irradiance(Path):
+class Expanded(Path):
+    """A path of slices, whose error is what it leaves out of the bands of material and light."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def left_out(material: Material, light: Any, degree: int) -> tuple[np.ndarray, np.ndarray]:
+        """Band norms of slices [C, V, l] and lights [C, P, l] whose product is what the path leaves out."""
+
+    @classmethod
+    def errors(cls, material, light, degree):
+        error, bound = predict(*cls.left_out(material, light, degree), material.shares)
+        return error, bound, predict(material.norms, light.norms, material.shares)[0]
+
+
+class Irradiance(Expanded):
     """Slices that are zonal about the normal and the same from all sides, of matt materials: the light convolved."""
 
     name = "irradiance"
@@ -76,7 +102,7 @@ class Irradiance(Path):
         return by_device(shade_points, as_type(points, dtype), _irradiance, c.astype(dtype))
 
 
-class Zonal(Path):
+class Zonal(Expanded):
     """Distant light that is symmetric about an axis: nothing is rotated."""
 
     name = "zonal light"
@@ -104,7 +130,7 @@ class Zonal(Path):
         return shade(self.slices, self.light, surface)
 
 
-class Table(Path):
+class Table(Expanded):
     """Any distant light, turned to the frame of every pixel and multiplied with the slice of its view."""
 
     name = "table"
@@ -131,7 +157,7 @@ class Table(Path):
         return shade(self.slices, self.light, surface)
 
 
-class AboveHorizon(Path):
+class AboveHorizon(Expanded):
     """A local light above the horizon, where alone the slices are fitted."""
 
     slices: Slices
@@ -176,7 +202,75 @@ class Portal(AboveHorizon):
         return _product_cost(material, light, degree)
 
 
-PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal)
+class Points(Path):
+    """A polygon light by Gauss points on it, `degree` x `degree` for a quadrilateral."""
+
+    name = "points"
+    takes = PolygonLight
+    expanded = False
+    material: Quadrature
+    light: Any
+
+    @staticmethod
+    def degrees(most):
+        return _ORDERS
+
+    @classmethod
+    def errors(cls, material, light, degree):
+        surface, exact = _samples(material, light)
+        off = _colours(shade(Quadrature(material.brdf, degree), light.light, surface)) - exact
+        rms = lambda x: np.sqrt(np.mean(x**2, axis=0))
+        missed = rms(exact) < 0.5 * predict(material.norms, light.norms, material.shares)[0]  # a lobe between points
+        return np.where(missed, np.inf, rms(off)), np.max(np.abs(off), axis=0), rms(exact)
+
+    @staticmethod
+    def cost(material, light, degree):
+        quads = 1 + (len(light.light.points) - 3) // 2
+        through = light.colours * (light.light_degree + 1) * (2 * light.light_degree + 1) if light.light_degree else 0
+        return float(quads * degree**2 * (_EVALUATION + through))
+
+    @classmethod
+    def make(cls, material, slices, lights, degree):
+        return cls(Quadrature(material.brdf, degree), lights[0].light)
+
+    def shade(self, surface):
+        return shade(self.material, self.light, surface)
+
+
+class PortalPoints(Points):
+    """A window by Gauss points on it."""
+
+    takes = PortalLight
+
+
+PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal, Points, PortalPoints)
+
+
+@functools.lru_cache(maxsize=16)
+def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
+    """Points of surfaces that face all ways, seen as in the picture of a sphere, and their radiance [N, C]."""
+    normals = _spread(_FACING)
+    u, v = np.modf(np.outer(np.arange(len(normals)) + 0.5, [0.7548776662466927, 0.5698402909980532]))[0].T
+    sine, turn = np.sqrt(u), 2 * np.pi * v  # of the angle between normal and view: cos^2 is even
+    across = np.cross(normals, np.roll(normals, 1, axis=1))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    tangents = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(normals, across)
+    views = np.sqrt(1 - u)[:, None] * normals + sine[:, None] * tangents
+    facing, seen, along = (jnp.asarray(a, float)[None] for a in (normals, views, across))
+    surface = Surface(facing, seen, jnp.asarray(light.points, float)[:, None], along)
+    return surface, _colours(shade(Quadrature(material.brdf, _EXACT), light.light, surface))
+
+
+def _spread(count: int) -> Float[np.ndarray, "count 3"]:
+    """Directions on a spiral, each of the same share of the sphere."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+
+
+def _colours(radiance: Array) -> np.ndarray:
+    values = np.asarray(radiance, float)
+    return values.reshape(values.shape[0] * values.shape[1], -1)
 
 
 def _irradiance(points: dict[str, Float[Array, "p 3"]], c: Float[Array, "*colour n"]) -> Float[Array, " p *colour"]:

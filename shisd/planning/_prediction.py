@@ -1,4 +1,4 @@
-"""Predicted errors: what a path at a degree leaves out of a material and a light, from norms of their bands."""
+"""A path at a degree, judged: its error relative to the radiance, for the worst colour, and its cost."""
 
 from typing import NamedTuple
 
@@ -27,20 +27,7 @@ class Choice(NamedTuple):
 
 def judge(path: type[Path], material: Material, light: Seen, degree: int) -> Choice:
     """A path at a degree, by the colour for which its error is largest."""
-    error, bound = predict(*path.left_out(material, light, degree), material.shares)
-    radiance = predict(material.norms, light.norms, material.shares)[0]
+    error, bound, radiance = path.errors(material, light, degree)
     dark = radiance <= _DARK * np.max(radiance)
     relative = lambda x: float(np.max(np.where(dark, 0, x / np.where(dark, 1, radiance))))
     return Choice(path, degree, relative(error), relative(bound), path.cost(material, light, degree))
-
-
-def predict(slices: np.ndarray, lights: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """RMS of the product of slices and lights, and a bound on it, from norms of their bands [C, V, l] and [C, P, l].
-
-    One for each colour [C]. The RMS is over views by their `shares` [V], points, and all rotations between slices and
-    lights; the bound holds for the worst of the rotations.
-    """
-    energy = np.einsum("v,cvl->cl", shares, slices**2) * np.mean(lights**2, axis=1)
-    worst = slices @ np.swapaxes(lights, 1, 2)  # [C, V, P]
-    square = np.sum(energy / (2 * np.arange(slices.shape[-1]) + 1), axis=-1)
-    return np.sqrt(square), np.sqrt(np.mean(np.einsum("v,cvp->cp", shares, worst**2), axis=1))

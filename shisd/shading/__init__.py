@@ -14,6 +14,7 @@ from shisd.shading._mirror import reflect as reflect
 from shisd.shading._prefiltered import Prefiltered as Prefiltered
 from shisd.shading._prefiltered import prefilter as prefilter
 from shisd.shading._project_light import project_light as project_light
+from shisd.shading._quadrature import Quadrature as Quadrature
 from shisd.shading._shade import shade as shade
 from shisd.shading._surface import Surface as Surface
 from shisd.shading.paths._occluded import visibility_gamma as visibility_gamma

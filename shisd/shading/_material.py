@@ -5,29 +5,33 @@ from shisd._module import Module
 from shisd._progress import Progress
 from shisd.models import AbstractBrdf
 from shisd.shading._matrix import BrdfMatrix
+from shisd.shading._quadrature import Quadrature
 from shisd.shading.slices._slices import Slices
 from shisd.shading.slices._tabulate import table
 from shisd.shading.slices._transformed import TransformedSlices, transform_brdf
 from shisd.shading.slices._upper import RIDGE
+
+LampForm = Slices | TransformedSlices | Quadrature
 
 
 class Material(Module):
     """A material as `shade` takes it.
 
     `distant`: slices that stand for it everywhere, or its matrix, for light from all around; `local`: slices for light
-    that is cut off at the horizon, best fitted above it; `lamps`: slices beyond maps of directions, which take their
-    place under polygons that shine alike in all directions. `None` where there is no such light.
+    that is cut off at the horizon, best fitted above it; `lamps`, which take their place under
+    polygons that shine alike in all directions: slices beyond maps of directions, or a `Quadrature` of the model, which
+    takes polygons with a profile and portals too. `None` where there is no such light.
     """
 
     distant: Slices | BrdfMatrix | None
     local: Slices | None
-    lamps: TransformedSlices | None
+    lamps: TransformedSlices | Quadrature | None
 
     def __init__(
         self,
         distant: Slices | BrdfMatrix | None = None,
         local: Slices | None = None,
-        lamps: TransformedSlices | None = None,
+        lamps: TransformedSlices | Quadrature | None = None,
     ):
         if distant is None and local is None and lamps is None:
             raise ValueError("a material needs `distant`, `local` or `lamps` slices; got none.")
@@ -37,8 +41,8 @@ class Material(Module):
             raise ValueError("`distant` was fitted above the horizon only; make it with domain='sphere'.")
         if not isinstance(local, Slices | None):
             raise ValueError(f"`local` must be shading.Slices; got {type(local).__name__}.")
-        if not isinstance(lamps, TransformedSlices | None):
-            raise ValueError(f"`lamps` must be shading.TransformedSlices; got {type(lamps).__name__}.")
+        if not isinstance(lamps, TransformedSlices | Quadrature | None):
+            raise ValueError(f"`lamps` must be shading.TransformedSlices or Quadrature; got {type(lamps).__name__}.")
         if local is not None and lamps is not None:
             if local.isotropic != lamps.isotropic:
                 raise ValueError(
@@ -53,7 +57,7 @@ class LocalForms(Module):
     """The slices of a material above the horizon."""
 
     plain: Slices | None
-    lamps: TransformedSlices | None
+    lamps: TransformedSlices | Quadrature | None
 
     @property
     def isotropic(self) -> bool:
@@ -64,7 +68,7 @@ class LocalForms(Module):
         return self.uniform.colour
 
     @property
-    def uniform(self) -> Slices | TransformedSlices:
+    def uniform(self) -> LampForm:
         """Those for light that is alike in all directions."""
         return self.plain if self.lamps is None else self.lamps  # type: ignore[return-value]  # one is there
 
@@ -95,7 +99,10 @@ def prepare(
     local_degree = degree if local_degree is None else _checks.integer("local_degree", local_degree)
     most = max(degree, local_degree)
     slices = table(brdf, most, (None, RIDGE), elevations, azimuths, quadrature, tolerance, throw, progress)
-    lamps = None if lamp_degree is None else transform_brdf(brdf, lamp_degree)
+    if lamp_degree is None:
+        lamps = None
+    else:
+        lamps = transform_brdf(brdf, lamp_degree, elevations=elevations, azimuths=azimuths)
     return Material(slices.cut(degree), slices.cut(local_degree).above_horizon(), lamps)
 
 
@@ -108,7 +115,7 @@ def as_material(material: object) -> Material:
             return Material(material, material)
         case Slices():
             return Material(None, material)
-        case TransformedSlices():
+        case TransformedSlices() | Quadrature():
             return Material(None, None, material)
         case BrdfMatrix(domain="sphere"):
             return Material(material)
@@ -120,7 +127,8 @@ def as_material(material: object) -> Material:
     hint = " Make it ready by shading.prepare." if isinstance(material, AbstractBrdf) else ""
     came = type(material).__name__
     raise ValueError(
-        f"`material` must come from shading.prepare, tabulate_brdf, transform_brdf or project_brdf; got {came}.{hint}"
+        "`material` must come from shading.prepare, tabulate_brdf, transform_brdf or project_brdf, or be a Quadrature; "
+        f"got {came}.{hint}"
     )
 
 

@@ -4,11 +4,11 @@ Scenes, float32, 16,384 points: a floor with slightly varied normals, views to 8
 ("floor") or beside a screen that stands on it, from 0.1 of its height on ("wall").
 
 Families (kernels and their sources: `area_lights`): ours, `shade` with a `PolygonLight` or `PortalLight` and slices
-fitted above the horizon; Gauss points on the light; Monte Carlo by solid angle, by the material, by both, all with
-shifted lattices; linearly transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the
-light by Xu et al.'s rule; the light's harmonics, turned to the local frame; axial moments. Points and samples of a
-portal look the distant light up in a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the
-window at the slices' degree.
+fitted above the horizon, slices beyond maps of directions, or the model at points; Gauss points on the light, written
+for this material and scene; Monte Carlo by solid angle, by the material, by both, all with shifted lattices; linearly
+transformed cosines; 1 and 3 spherical Gaussians for each elevation, integrated over the light by Xu et al.'s rule; the
+light's harmonics, turned to the local frame; axial moments. Points and samples of a portal look the distant light up in
+a table, bilinearly, which costs 3e-4 of their accuracy; the triple product cuts the window at the slices' degree.
 Derivatives are measured in the full run, in one polygon task, as their cost depends on no numbers: of ours, points and
 samples of the light and transformed cosines; for projections of ours and of points. Those of points and samples are of
 the sum as it stands, without what happens where the light crosses the horizon, and by JAX's reverse mode, which XLA
@@ -146,6 +146,11 @@ def fitted_slices(name: str, degree: int):
 
 
 @functools.cache
+def transformed_slices(name: str, degree: int):
+    return timed(shading.transform_brdf, brdf(name), degree)
+
+
+@functools.cache
 def fitted_cosines(name: str):
     table, seconds = timed(polygons.fit_ltc, brdf(name), 64)
     return jax.tree.map(lambda x: x.astype(jnp.float32), table), seconds
@@ -174,6 +179,15 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
         table, seconds = fitted_slices(name, degree)
         differentiated = lit_by_polygon if degree == 8 else None  # compiling a derivative takes 10 s
         add("shisd", f"degree {degree}", lit_by_polygon, table, differentiated, setup=seconds, ours=True)
+    for degree in (4, 8)[half]:
+        table, seconds = transformed_slices(name, degree)
+        differentiated = lit_by_polygon if degree == 8 else None
+        setting = f"beyond maps, degree {degree}"
+        add("shisd", setting, lit_by_polygon, table, differentiated, setup=seconds, ours=True)
+    for order in (2, 4, 8)[half]:
+        differentiated = lit_by_polygon if order == 4 else None
+        model = shading.Quadrature(brdf(name), order)
+        add("shisd", f"points, {order} x {order}", lit_by_polygon, model, differentiated, ours=True)
     for family, kernel, differentiable in (
         ("Gauss points", area_lights.gauss_points, True),
         ("Monte Carlo, solid angle", area_lights.by_solid_angle, True),
@@ -219,6 +233,9 @@ def portal_task(name: str, stored) -> Task:
         product, more = timed(functools.partial(harmonics.product_matrix, input_degree=degree), coefficients, degree)
         parameters, kernel = (area_lights.slices(table), product), shaded(area_lights.triple_products, degree, size=128)
         methods += [own, Method("SH triple product", f"degree {degree}", kernel, parameters, setup=seconds + more)]
+    for order in (2, 4, 8):
+        parameters = shading.Quadrature(brdf(name), order), light
+        methods.append(Method("shisd", f"points, {order} x {order}", lit_through_portal, parameters, ours=True))
     lookup = functools.partial(harmonics.evaluate, coefficients)
     texels, seconds = timed(lookup, area_lights.octahedron(513).astype(np.float32))
     for family, kernel, counts in (

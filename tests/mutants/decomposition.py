@@ -145,7 +145,7 @@ MUTANTS = [
     ),
     Mutant(
         "predictions without the number of harmonics",
-        "shisd/planning/_prediction.py",
+        "shisd/planning/_bands.py",
         old="energy / (2 * np.arange(slices.shape[-1]) + 1)",
         new="energy",
         test="tests/test_planning.py::test_prediction_is_the_mean_over_rotations_and_the_bound_holds",

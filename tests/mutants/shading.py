@@ -4,6 +4,7 @@ from tests.mutants import Mutant
 
 POLYGON, SURFACE = "tests/shading/test_polygon.py::", "tests/shading/test_surface.py::"
 MIRROR, SHADE = "tests/shading/test_mirror.py::", "tests/shading/test_shade.py::"
+POINTS = "tests/shading/test_quadrature.py::"
 LIGHTS, BEYOND = "tests/models/test_lights.py::", "tests/shading/test_transformed.py::"
 OUTLINE, DISTANT = "shisd/models/lights/_outline.py", "shisd/models/lights/_distant.py"
 SLICES = "shisd/shading/slices/_slices.py"
@@ -61,8 +62,23 @@ MUTANTS = [
         test="tests/decomposition/test_transformed.py::test_derivatives_of_a_fit",
     ),
     Mutant(
-        "no clip at the horizon", "shisd/shading/paths/_polygon.py",
+        "no clip at the horizon", "shisd/shading/paths/_cut.py",
         old="whole, lambda: in_lanes(clip, (outline, above)))", new="whole, whole)", test=SLICE,
+    ),
+    Mutant(
+        "patches are flat", "shisd/shading/_quadrature.py",
+        old="d - a, (a - b) - (d - c))", new="d - a, 0 * a)",
+        test=POINTS + "test_radiance_of_the_model[six corners]",
+    ),
+    Mutant(
+        "fans leave out their last corner", "shisd/shading/_quadrature.py",
+        old="np.minimum(first + 2, slots - 1)", new="first + 1",
+        test=POINTS + "test_radiance_of_the_model[six corners]",
+    ),
+    Mutant(
+        "balls are polygons within them", "shisd/shading/paths/_sphere.py",
+        old="versed = jnp.sin(part * t) / (math.sin(part) * jnp.cos(part * (1 - t)))", new="versed = t",
+        test=POINTS + "test_balls_are_polygons_of_their_solid_angle",
     ),
     Mutant(
         "a light's plane from absolute coordinates", OUTLINE,

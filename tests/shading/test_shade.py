@@ -242,7 +242,8 @@ def test_what_a_surface_lacks(as_user, rng):
 
 def test_what_is_no_material(as_user, rng):
     light, surface = lights_of(rng, np.float32)["map"], surface_of(rng, np.float32)
-    where = "`material` must come from shading.prepare, tabulate_brdf, transform_brdf or project_brdf; got"
+    sources = "shading.prepare, tabulate_brdf, transform_brdf or project_brdf, or be a Quadrature"
+    where = f"`material` must come from {sources}; got"
     fails(f"{where} Lambertian. Make it ready by shading.prepare.", models.Lambertian(0.5), light, surface)
     fails(f"{where} ndarray.", np.ones((8, 9), np.float32), light, surface)
 

@@ -11,34 +11,26 @@ only they are turned to the local frame.
 """
 
 import functools
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from shisd import _checks
-from shisd._lanes import in_lanes
 from shisd._numerics import dot, times
 from shisd._typing import Array, Float
-from shisd.domains.internal import (
-    Loop,
-    clip,
-    fold_expansion,
-    loop_coefficients,
-    on_sphere,
-    zonal_inverse,
-)
+from shisd.domains.internal import Loop, clip, loop_coefficients, on_sphere
 from shisd.harmonics.internal import product_matrices, rotate_many
 from shisd.models import PolygonLight, PortalLight
 from shisd.models.internal import facing
-from shisd.shading._incidence import Y_00, angle_above, incidence_integrals
+from shisd.shading._incidence import Y_00, angle_above
 from shisd.shading._material import LocalForms, local_forms
+from shisd.shading._quadrature import Quadrature
 from shisd.shading._tiles import shade_tiles, stacked, sum_lights
-from shisd.shading._transformed_integrals import integrals, tables_of
+from shisd.shading.paths._cut import POINTS_TILE, above_horizon, at_points, in_frame, integrals_of
 from shisd.shading.paths._path import local_path
-from shisd.shading.slices._slices import Slices, lookup_factors, lookup_table, slice_values
-from shisd.shading.slices._transformed import TransformedSlices, dense_views
+from shisd.shading.slices._slices import Slices, lookup_table, slice_values
 
 Light = PolygonLight | PortalLight
 _TILE = 256  # pixels at a time
@@ -50,8 +42,9 @@ def _shade(
     points: dict[str, Float[Array, "p 3"]], forms: LocalForms, lights: list[Light], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     kinds = stacked(lights)
-    stacks = [(stack, _products(stack, forms.plain)) for stack in kinds]
-    uniform = _integrals(forms.uniform)
+    model = forms.lamps if isinstance(forms.lamps, Quadrature) else None
+    stacks = [(stack, _products(stack, forms.plain) if model is None else _expansions(stack)) for stack in kinds]
+    uniform = integrals_of(forms.uniform)
     directional = (
         None if forms.plain is None else functools.partial(_directional, forms.plain, lookup_table(forms.plain))
     )
@@ -66,61 +59,33 @@ def _shade(
             relative = light.points.T[:, :, None] - positions.T[:, None]
             above = dot(frame[:, :, 2].T[:, None], relative)
             sign = jnp.where(jnp.max(above, axis=0) > 0, facing(light, relative), 0)
-            outline = _in_frame(frame, relative)
-            if product is None or directional is None:
-                lit = _above_horizon(functools.partial(uniform, local), forms.colour, outline, above, sign)
+            outline = in_frame(frame, relative)
+            if product is None:
+                lit = above_horizon(functools.partial(uniform, local), forms.colour, outline, above, sign)
                 lit = times(lit, light.incident() * Y_00)
+            elif model is not None:
+                points = functools.partial(at_points, model, local, (frame, product))
+                lit = above_horizon(points, np.broadcast_shapes(model.colour, light.colour), outline, above, sign)
             else:
-                lit = directional(frame, local, outline, product)
+                lit = directional(frame, local, outline, product)  # type: ignore[misc]  # with a product they are there
             return jnp.broadcast_to(times(lit, sign), zero.shape)
 
         return sum_lights(of_light, stacks, zero)
 
-    size = _TILE if all(product is None for _, product in stacks) else SMALL_TILE
+    if model is not None:
+        size = POINTS_TILE
+    else:
+        size = _TILE if all(product is None for _, product in stacks) else SMALL_TILE
     return shade_tiles(forms, points, colour, size, of_tile, kinds)
 
 
 PATH = local_path(local_forms, _shade)
 
 
-def _above_horizon(
-    integrals: Callable[[Loop, int], Array], colour: tuple[int, ...], outline: Loop, above: Array, sign: Array
-) -> Float[Array, "*colour p"]:
-    """`integrals(v, spare)` over outlines cut off at the horizon, whose last `spare` edges seldom have a length."""
-    dark = sign == 0
-    spare = outline.shape[1] // 2  # edges, unless the horizon cuts an outline of this tile
-
-    def lit() -> Float[Array, "*colour p"]:
-        whole = lambda: jnp.concatenate([outline, *[outline[:, :1]] * spare], axis=1)
-        all_whole = jnp.all((jnp.min(above, axis=0) > 0) | dark)
-        cut = jax.lax.cond(all_whole, whole, lambda: in_lanes(clip, (outline, above)))
-        return integrals(in_lanes(on_sphere, (cut,)), spare)
-
-    nothing = lambda: jnp.zeros((*colour, outline.shape[2]), outline.dtype)
-    return jax.lax.cond(jnp.all(dark), nothing, lit)
-
-
-def _integrals(slices: Slices | TransformedSlices) -> Callable[[Array, Loop, int], Array]:
-    """integrals(local views, v, spare) of slices over outlines."""
-    if isinstance(slices, Slices):
-        return functools.partial(_uniform, slices, lookup_table(slices))
-    tables = tables_of(slices)
-    return lambda local, v, spare: integrals(slices, tables, dense_views(local), v, spare)
-
-
-def _uniform(slices: Slices, table: Array, local: Array, v: Loop, spare: int) -> Float[Array, "*colour p"]:
-    """Integrals of plain slices."""
-    angle = angle_above(v)
-    if slices.isotropic:
-        constant, of_colours = table[..., 0, :] @ lookup_factors(local, slices), table
-        of_one = lambda t: incidence_integrals(t, local, v, slices.degree, spare)
-    else:
-        of_colours = slice_values(table, local, slices)
-        constant, inverse = of_colours[..., 0, :], zonal_inverse(slices.degree, table.dtype)
-        of_one = lambda c: fold_expansion(c, v, *inverse, spare)
-    # colours in a loop: compiled code would grow with their number
-    rest = jax.lax.map(of_one, of_colours) if slices.colour else of_one(of_colours)
-    return times(constant, angle * Y_00) + rest
+def _expansions(stack: Light) -> Float[Array, " lights *colour_n"] | None:
+    """Coefficients of lights by direction; None where they are constant."""
+    incident = jax.vmap(lambda light: light.incident())(stack)
+    return None if incident.shape[-1] == 1 else incident
 
 
 def _directional(
@@ -129,16 +94,11 @@ def _directional(
     """Integrals of slices times the light's radiance, over its outline above the horizon."""
     c, v = slice_values(table, local, slices), on_sphere(clip(outline, outline[2]))
     to_local = jnp.swapaxes(frame, 1, 2)
-    world = _in_frame(to_local, v)
+    world = in_frame(to_local, v)
     seen = through(product, world, angle_above(v)).reshape(-1, c.shape[-2], v.shape[2])
     seen = rotate_many(jnp.moveaxis(seen, 0, 1), to_local, slices.degree, slices.isotropic)
     seen = jnp.moveaxis(seen, 1, 0).reshape(*product.shape[:-2], *c.shape[-2:])
     return jnp.sum(times(c, seen), axis=-2)
-
-
-def _in_frame(frame: Float[Array, "p 3 3"], v: Loop) -> Loop:
-    """frame^T v, written out: as an einsum the gradient of a lamp takes 1.5 times as long (degree 8, jax 0.10.2)."""
-    return jnp.stack([dot(axis[:, None], v) for axis in jnp.moveaxis(frame, 0, -1).swapaxes(0, 1)])
 
 
 def _products(stack: Light, slices: Slices | None) -> Float[Array, " lights *colour_n_m"] | None:
