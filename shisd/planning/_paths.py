@@ -21,7 +21,7 @@ from shisd.shading.internal import as_type, finite_mark, finite_or_nan, shade_po
 _ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
 _EXACT = 24  # the order that others are compared with
 _FACING = 1024  # normals
-_EVALUATION = 100  # of a model, in multiply-adds
+_EVALUATION = 200  # of a model, in multiply-adds: as long as that many of slices
 
 
 class Path(Module):

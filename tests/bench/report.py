@@ -1,8 +1,8 @@
 """Speed against error, every method on the same inputs: python -m tests.bench.report [--quick] [--pages].
 
 Writes DIR/report.json with every row, DIR/report.md with tables, and a figure for each group of tasks to DIR/figures;
---pages also puts both into docs/, the short tables between the markers of docs/benchmarks.md, and an entry at the end
-of docs/history.json. `make report` sets the allocator.
+--pages also puts both into docs/, the short tables between the markers of docs/benchmarks.md, some rows into README.md,
+and an entry at the end of docs/history.json. `make report` sets the allocator.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import numpy as np
 
 from shisd.io.internal import write_atomically
 from tests.bench import applications, environments, harness, history, local_lights, renderers, roofline, spherical
-from tests.bench.run import DOCS, paste, table
+from tests.bench.run import DOCS, README, paste, table
 
 GROUPS = {  # name: (title, tasks)
     "environments": ("A sphere under a map", environments.tasks),
@@ -26,6 +26,28 @@ GROUPS = {  # name: (title, tasks)
     "renderers": ("Whole pictures", renderers.tasks),
 }
 TABLES = {"roofline": roofline.tables, "applications": applications.tables}
+HEADLINES = {  # of README: (task, family) of the tables to what they are called there
+    ("GGX 0.5, interior", "Monte Carlo, MIS"): (
+        "GGX 0.5 under a room", "Monte Carlo with multiple importance sampling"
+    ),
+    ("GGX 0.25, studio", "SH rotation of the light"): ("GGX 0.25 under a studio", "SH rotation of the light"),
+    ("GGX 0.25, sun", "point lights"): ("GGX 0.25 under a sun", "point lights"),
+    ("GGX 0.1, interior", "spherical Gaussians"): ("GGX 0.1 under a room", "spherical Gaussians"),
+    ("GGX 0.3 sphere under a map", "Mitsuba 3 scalar_rgb"): ("a sphere of GGX 0.3 under a map", "Mitsuba 3, scalar"),
+    ("GGX 0.5, floor below a panel", "Gauss points"): (
+        "GGX 0.5, floor below a panel", "Gauss points, written for the scene"
+    ),
+    ("GGX 0.1, floor below a panel", "linearly transformed cosines"): (
+        "GGX 0.1, floor below a panel", "linearly transformed cosines"
+    ),
+    ("A quad on harmonics of degree 30", "Monte Carlo, solid angle"): (
+        "a quad on harmonics of degree 30", "Monte Carlo over its solid angle"
+    ),
+    ("Basis, degree 8", "sphericart"): ("basis of degree 8", "sphericart (C++)"),
+    ("1,000 rotations of an RGB expansion, degree 8", "e3nn-jax"): (
+        "1,000 rotations of an RGB expansion, degree 8", "e3nn-jax"
+    ),
+}  # fmt: skip
 APART = ("applications",)  # only when named: `make applications`, and with a file of its own
 
 
@@ -64,6 +86,16 @@ def leads(panels: dict[str, list[dict]], item: str) -> list[dict]:
     return lines
 
 
+def headlines(found: dict[tuple[str, str], str]) -> list[dict]:
+    """README's rows, from cells "ratio at error" by task and family; below 1 the other is ahead, and bold."""
+    lines = []
+    for key, (task, beside) in HEADLINES.items():
+        ratio, error = found.get(key, "- at -").split(" at ")
+        bold = f"**{ratio}**" if ratio != "-" and float(ratio) < 1 else ratio
+        lines.append({"task": task, "beside": beside, "its time / ours": bold, "at relative error": error})
+    return lines
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, default=Path("output/report"))
@@ -82,6 +114,7 @@ def main() -> None:
         sections[name] = short, long
         print(f"{long}\n\n[{time.perf_counter() - start:.0f} s]\n", flush=True)
 
+    cells: dict[tuple[str, str], str] = {}
     folders = [arguments.output, *([DOCS] if arguments.pages else [])]
     for folder in folders:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
@@ -104,12 +137,17 @@ def main() -> None:
                 harness.draw(of_item, item, folder / "figures" / file)
             lead = "Time over ours at equal error, where that is least, and that error; errors from 10 % to our least."
             shown = f"![{title}: relative error against us per {item}](figures/{file})\n\n{lead}"
-            short += [shown, table(leads(of_item, item))]
-            long += [shown, table(leads(of_item, item))]
+            led = leads(of_item, item)
+            cells |= {(line["task"], family): cell for line in led for family, cell in line.items() if " at " in cell}
+            short += [shown, table(led)]
+            long += [shown, table(led)]
             long.append("Every method: medians of its costs, and its relative RMSE in each task.")
             long.append(table(summary(of_item, item)))
         if name == "renderers":
             equal = [line for rows in panels["pixel"].values() for line in renderers.equal_error(rows)]
+            for line in equal[::-1]:  # the first of a picture stays
+                cell = f"{line['time / ours']:.2g} at {line['relative RMSE']:.1g}"
+                cells[line["picture"], line["renderer"]] = cell
             short = [f"{inspect.cleandoc(renderers.__doc__ or '')}", table(equal)]
             long += ["What the renderer takes for our error:", table(equal)]
         notes = {"spherical": spherical.notes, "renderers": renderers.notes}.get(name, list)()
@@ -131,6 +169,7 @@ def main() -> None:
         if f"<!-- table:{name} -->" in (DOCS / "benchmarks.md").read_text():
             paste(name, short)
     if arguments.pages and not (arguments.only or arguments.quick):
+        paste("headlines", table(headlines(cells)), README)
         history.remember(results)
     print(f"{arguments.output}/report.md and report.json: {time.perf_counter() - start:.0f} s in all")
 

@@ -245,6 +245,7 @@ def cost_figure(rows, path):
 
 
 DOCS = Path("docs")
+README = DOCS.parent / "README.md"
 BENCHES = {
     "equation_22": bench_equation_22,
     "memory": bench_memory,
@@ -291,9 +292,9 @@ def table(rows):
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def paste(name, text):
-    """Put a text between the markers of a name in the page of benchmarks."""
-    page, start = DOCS / "benchmarks.md", f"<!-- table:{name} -->"
+def paste(name, text, page=DOCS / "benchmarks.md"):
+    """Put a text between the markers of a name in a page."""
+    start = f"<!-- table:{name} -->"
     before, rest = page.read_text().split(start)
     rest = rest.split("<!-- /table -->", 1)[1]
     write_atomically(page, f"{before}{start}\n{text}\n<!-- /table -->{rest}", overwrite=True)
