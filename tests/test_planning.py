@@ -58,8 +58,10 @@ def planned():
     return planning.plan(scene(), 0.03, max_degree=MAX_DEGREE)
 
 
-def general(material, light, degree, positions, normals, views):
-    """One light at one degree by the path that always works."""
+def general(material, light, degree, positions, normals, views, path="table"):
+    """One light at one degree by the path that always works, or by points."""
+    if path == "points":
+        return shading.shade(shading.Quadrature(material, degree), light, shading.Surface(normals, views, positions))
     if isinstance(light, models.Environment):
         slices = shading.tabulate_brdf(material, degree)
         return shading.shade(slices, light.light(degree), shading.Surface(normals, views))
@@ -132,7 +134,7 @@ def test_a_plan_is_the_general_path_at_its_degrees(material, rng):
     entries = [e for e in planned().entries if e.material == material]
     expected = 0.0
     for e in entries:
-        lit = general(MATERIALS[material], scene().lights[e.light], e.degree, *where)
+        lit = general(MATERIALS[material], scene().lights[e.light], e.degree, *where, e.path)
         expected = expected + np.asarray(lit).reshape(40, -1)
     got = planned().shade(material, surface(*where))
     assert got.shape == (40, 3) and got.dtype == np.float32
@@ -156,7 +158,7 @@ def test_the_tolerance_is_met_against_quadrature(material, light, rng):
     """Every pair by itself, at pixels that the plan has not seen."""
     brdf, source = MATERIALS[material], scene().lights[light]
     made = planning.plan(planning.Scene({"it": brdf}, {"light": source}, scene().points), 0.03, max_degree=MAX_DEGREE)
-    where = pixels(rng, 200)
+    where = pixels(rng, 200 if light == "room" else 2000)
     if light == "room":
         truth = reference.shade_environment_quadrature(brdf, source, *where[1:])
     else:
@@ -165,7 +167,8 @@ def test_the_tolerance_is_met_against_quadrature(material, light, rng):
     error = np.max(np.sqrt(mean(made.shade("it", surface(*where)) - truth) / mean(truth)))  # of the worst colour
     assert error < 0.03
     if (material, light) != ("clay", "lamp"):  # which is exact but for the ridge
-        assert 0.5 < error / made.entries[0].error < 2
+        most = 3 if made.entries[0].path == "points" else 2  # few pixels make most of its error
+        assert 1 / most < error / made.entries[0].error < most
 
 
 def test_errors_are_those_of_the_worst_colour(rng):
@@ -210,8 +213,8 @@ def test_windows(rng):
     e[0] = 2.0
     portal, brdf = models.PortalLight(LAMP, e), MATERIALS["satin"]
     made = planning.plan(planning.Scene({"it": brdf}, {"window": portal}, scene().points), 0.03, max_degree=8)
-    assert made.entries[0].path == "portal" and made.status == Status.ok
-    where = pixels(rng, 200)
+    assert made.entries[0].path == "points" and made.status == Status.ok
+    where = pixels(rng, 2000)
     through = lambda w: harmonics.evaluate(e, w)
     truth = reference.shade_polygon_quadrature(brdf, LAMP, through, *where)
     error = np.sqrt(np.mean((made.shade("it", surface(*where)) - truth) ** 2) / np.mean(np.square(truth)))

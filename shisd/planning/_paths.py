@@ -218,7 +218,7 @@ class Points(Path):
     @classmethod
     def errors(cls, material, light, degree):
         surface, exact = _samples(material, light)
-        off = _colours(shade(Quadrature(material.brdf, degree), light.light, surface)) - exact
+        off = _by_points(material, light, degree, surface) - exact
         rms = lambda x: np.sqrt(np.mean(x**2, axis=0))
         missed = rms(exact) < 0.5 * predict(material.norms, light.norms, material.shares)[0]  # a lobe between points
         return np.where(missed, np.inf, rms(off)), np.max(np.abs(off), axis=0), rms(exact)
@@ -231,7 +231,7 @@ class Points(Path):
 
     @classmethod
     def make(cls, material, slices, lights, degree):
-        return cls(Quadrature(material.brdf, degree), lights[0].light)
+        return cls(Quadrature(as_type(material.brdf, float), degree), lights[0].light)
 
     def shade(self, surface):
         return shade(self.material, self.light, surface)
@@ -258,7 +258,7 @@ def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
     views = np.sqrt(1 - u)[:, None] * normals + sine[:, None] * tangents
     facing, seen, along = (jnp.asarray(a, float)[None] for a in (normals, views, across))
     surface = Surface(facing, seen, jnp.asarray(light.points, float)[:, None], along)
-    return surface, _colours(shade(Quadrature(material.brdf, _EXACT), light.light, surface))
+    return surface, _by_points(material, light, _EXACT, surface)
 
 
 def _spread(count: int) -> Float[np.ndarray, "count 3"]:
@@ -268,8 +268,10 @@ def _spread(count: int) -> Float[np.ndarray, "count 3"]:
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
 
 
-def _colours(radiance: Array) -> np.ndarray:
-    values = np.asarray(radiance, float)
+def _by_points(material: Material, light: Local, order: int, surface: Surface) -> np.ndarray:
+    """Radiance [N, C]."""
+    brdf, own = as_type((material.brdf, light.light), float)
+    values = np.asarray(shade(Quadrature(brdf, order), own, surface), float)
     return values.reshape(values.shape[0] * values.shape[1], -1)
 
 

@@ -235,6 +235,6 @@ MUTANTS = [
     Mutant(
         "slices above the horizon are not fitted", SLICES,
         old='self._with(fit_above(self.coefficients, ridge), "upper")', new='self._with(self.coefficients, "upper")',
-        test="tests/test_planning.py::test_the_tolerance_is_met_against_quadrature[clay-lamp]",
+        test="tests/shading/test_tables.py::test_above_the_horizon_a_cosine_is_of_degree_one",
     ),
 ]  # fmt: skip

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from shisd import models, shading
+from shisd import harmonics, models, shading
 from shisd.shading import _views
 from shisd.shading.slices._tabulate import by_convergence
 from tests.models.materials import hemisphere_rule
@@ -132,3 +132,13 @@ def test_glossy_dielectrics_are_tabulated_without_help(roughness, x64):
     exact = dense(brdf, theta[0], 10)
     error = np.linalg.norm(got - exact) / np.linalg.norm(exact)
     assert error < 1e-4 and float(table.error) < 1e-3
+
+
+def test_above_the_horizon_a_cosine_is_of_degree_one(rng):
+    """Cut at the horizon it needs all degrees; fitted where light comes from it needs one."""
+    slices = shading.tabulate_brdf(models.Lambertian(np.float32(1)), 8, elevations=4).cut(1).above_horizon()
+    w = rng.normal(size=(50, 3)).astype(np.float32)
+    w /= np.linalg.norm(w, axis=1, keepdims=True)
+    w[:, 2] = np.abs(w[:, 2])
+    got = harmonics.evaluate(slices.coefficients[1], w)
+    np.testing.assert_allclose(got, w[:, 2] / np.pi, atol=1e-5)
