@@ -182,12 +182,12 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
     for degree in (4, 8)[half]:
         table, seconds = transformed_slices(name, degree)
         differentiated = lit_by_polygon if degree == 8 else None
-        setting = f"beyond maps, degree {degree}"
-        add("shisd", setting, lit_by_polygon, table, differentiated, setup=seconds, ours=True)
+        setting = f"degree {degree}"
+        add("shisd, beyond maps", setting, lit_by_polygon, table, differentiated, setup=seconds, ours=True)
     for order in (2, 4, 8)[half]:
         differentiated = lit_by_polygon if order == 4 else None
         model = shading.Quadrature(brdf(name), order)
-        add("shisd", f"points, {order} x {order}", lit_by_polygon, model, differentiated, ours=True)
+        add("shisd, points", f"{order} x {order}", lit_by_polygon, model, differentiated, ours=True)
     for family, kernel, differentiable in (
         ("Gauss points", area_lights.gauss_points, True),
         ("Monte Carlo, solid angle", area_lights.by_solid_angle, True),
@@ -235,7 +235,7 @@ def portal_task(name: str, stored) -> Task:
         methods += [own, Method("SH triple product", f"degree {degree}", kernel, parameters, setup=seconds + more)]
     for order in (2, 4, 8):
         parameters = shading.Quadrature(brdf(name), order), light
-        methods.append(Method("shisd", f"points, {order} x {order}", lit_through_portal, parameters, ours=True))
+        methods.append(Method("shisd, points", f"{order} x {order}", lit_through_portal, parameters, ours=True))
     lookup = functools.partial(harmonics.evaluate, coefficients)
     texels, seconds = timed(lookup, area_lights.octahedron(513).astype(np.float32))
     for family, kernel, counts in (
