@@ -61,6 +61,15 @@ def cross(a: Vector, b: Vector) -> Array:
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+def tangents(u: Vector) -> tuple[Array, Array]:
+    """Two unit vectors that complete the unit vectors u to frames (Duff et al. 2017), components on the first axis."""
+    x, y, z = u
+    sign = jnp.where(z < 0, -1, 1).astype(z.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return jnp.stack([1 + sign * x * x * a, sign * b, -sign * x]), jnp.stack([b, sign + y * y * a, -y])
+
+
 def same_dtype(a: Array, b: Array) -> tuple[Array, Array]:
     """Both in the dtype that they promote to, also where JAX promotes nothing by itself."""
     with jax.numpy_dtype_promotion("standard"):

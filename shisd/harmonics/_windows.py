@@ -17,7 +17,7 @@ import numpy as np
 import optimistix as optx
 
 from shisd import _checks
-from shisd._numerics import normalize
+from shisd._numerics import normalize, tangents
 from shisd._sharding import by_device
 from shisd._status import Status, settled
 from shisd._typing import Array, ArrayLike, Float, Scalar
@@ -165,7 +165,7 @@ def _lowest_direction(c: Float[Array, " n"], degree: int) -> Float[Array, "3"]:
     unit = (1e-4 if c.dtype == np.float64 else 1e-2) / (degree + 1)  # far below the finest wave, far above rounding
 
     def step(u, _):
-        frame = _tangents(u)
+        frame = jnp.stack(tangents(u))
         f = _sh.evaluate(c, u[None] + jnp.asarray(unit * lattice, c.dtype) @ frame).reshape(3, 3)
         slope_x, slope_y = (f[2, 1] - f[0, 1]) / 2, (f[1, 2] - f[1, 0]) / 2
         xx, yy = f[2, 1] - 2 * f[1, 1] + f[0, 1], f[1, 2] - 2 * f[1, 1] + f[1, 0]
@@ -188,15 +188,6 @@ def _lowest_direction(c: Float[Array, " n"], degree: int) -> Float[Array, "3"]:
 def _on_grid(c: Float[Array, " n"], degree: int) -> Float[Array, "h w"]:
     height = 4 * (degree + 1)
     return _transform.synthesize(c, "fejer", height, 2 * height)
-
-
-def _tangents(u: Float[Array, "3"]) -> Float[Array, "2 3"]:
-    """Two unit vectors that complete `u` to a frame (Duff et al. 2017)."""
-    x, y, z = u
-    sign = jnp.where(z < 0, -1, 1).astype(u.dtype)
-    a = -1 / (sign + z)
-    b = x * y * a
-    return jnp.stack([1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y]).reshape(2, 3)
 
 
 @functools.cache

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from shisd import _checks
 from shisd._module import Module
-from shisd._numerics import safe_sqrt
+from shisd._numerics import dot, safe_sqrt
 from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar, Vector
 
 Colour = Float[Array, "..."]  # () or (3,); the parameters of one model may mix both
@@ -122,12 +122,12 @@ def cast(model: Pytree, dtype: DTypeLike) -> Pytree:
 
 def half_vector(wi: Vector, wo: Vector) -> tuple[Vector, Scalar]:
     """The unit half vector h, and cos(theta_d) = wi.h = wo.h = |wi + wo| / 2."""
-    total = [wi[i] + wo[i] for i in range(3)]
-    scale = jax.lax.stop_gradient(functools.reduce(jnp.maximum, [jnp.abs(x) for x in total]))
-    scaled = [x / scale for x in total]
-    length = jnp.sqrt(scaled[0] ** 2 + scaled[1] ** 2 + scaled[2] ** 2)
-    half = [x / length for x in scaled]
-    return jnp.stack(half), (total[0] * half[0] + total[1] * half[1] + total[2] * half[2]) / 2
+    total = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
+    scale = jax.lax.stop_gradient(functools.reduce(jnp.maximum, map(jnp.abs, total)))
+    x, y, z = (t / scale for t in total)
+    length = jnp.sqrt(x * x + y * y + z * z)
+    half = x / length, y / length, z / length
+    return jnp.stack(half), dot(total, half) / 2
 
 
 def schlick_fresnel(cosine: Scalar, f0: Colour) -> Colour:

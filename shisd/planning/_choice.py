@@ -15,7 +15,7 @@ from shisd._status import Status
 from shisd._typing import Array, Float
 from shisd.decomposition.internal import TABLE_DEGREE
 from shisd.planning._bands import Material, Seen, known_light, known_material
-from shisd.planning._paths import PATHS, Irradiance, Path, Table
+from shisd.planning._paths import PATHS, Expanded, Irradiance, Path, Table
 from shisd.planning._prediction import Choice, judge
 from shisd.planning._scene import Scene
 from shisd.shading import Surface, tabulate_brdf
@@ -147,7 +147,7 @@ def _plan(
         material = known_material(brdf, reference, elevations)
         choices = {of: _choose(material, light, tolerance / margin, max_degree) for of, light in lights.items()}
         choices, hosts = _join(material, lights, choices, tolerance / margin)
-        needed = [choice.degree for choice in choices.values() if choice.path.expanded]
+        needed = [choice.degree for choice in choices.values() if issubclass(choice.path, Expanded)]
         slices = as_type(tabulate_brdf(brdf, max(needed), elevations=elevations), float) if needed else None
         for of, choice in choices.items():
             alone = hosts[of] == of

@@ -12,6 +12,7 @@ from shisd._module import Module
 from shisd._numerics import normalize
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
+from shisd.decomposition import fibonacci_directions
 from shisd.harmonics import convolve, evaluate
 from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
 from shisd.planning._bands import Distant, Local, Material, predict
@@ -32,7 +33,6 @@ class Path(Module):
 
     name: ClassVar[str]
     takes: ClassVar[type]
-    expanded: ClassVar[bool] = True
 
     @staticmethod
     def degrees(most: int) -> Iterable[int]:
@@ -52,7 +52,7 @@ class Path(Module):
     @classmethod
     @abc.abstractmethod
     def make(cls, material: Material, slices: Any, lights: list, degree: int) -> "Path":
-        """The path, ready to be called; `slices`, of this degree or a higher one, if it is `expanded`."""
+        """The path, ready to be called; `slices`, of this degree or a higher one, if it is `Expanded`."""
 
     @abc.abstractmethod
     def shade(self, surface: Surface) -> Array:
@@ -207,7 +207,6 @@ class Points(Path):
 
     name = "points"
     takes = PolygonLight
-    expanded = False
     material: Quadrature
     light: Any
 
@@ -246,10 +245,11 @@ class PortalPoints(Points):
 PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal, Points, PortalPoints)
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=1)  # the orders of one pair follow each other
 def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
     """Points of surfaces that face all ways, seen as in the picture of a sphere, and their radiance [N, C]."""
-    normals = _spread(_FACING)
+    axes = np.asarray(fibonacci_directions(_FACING // 2), float)
+    normals = np.concatenate([axes, -axes])
     u, v = np.modf(np.outer(np.arange(len(normals)) + 0.5, [0.7548776662466927, 0.5698402909980532]))[0].T
     sine, turn = np.sqrt(u), 2 * np.pi * v  # of the angle between normal and view: cos^2 is even
     across = np.cross(normals, np.roll(normals, 1, axis=1))
@@ -259,13 +259,6 @@ def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
     facing, seen, along = (jnp.asarray(a, float)[None] for a in (normals, views, across))
     surface = Surface(facing, seen, jnp.asarray(light.points, float)[:, None], along)
     return surface, _by_points(material, light, _EXACT, surface)
-
-
-def _spread(count: int) -> Float[np.ndarray, "count 3"]:
-    """Directions on a spiral, each of the same share of the sphere."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
 
 
 def _by_points(material: Material, light: Local, order: int, surface: Surface) -> np.ndarray:

@@ -18,9 +18,9 @@ class Material(Module):
     """A material as `shade` takes it.
 
     `distant`: slices that stand for it everywhere, or its matrix, for light from all around; `local`: slices for light
-    that is cut off at the horizon, best fitted above it; `lamps`, which take their place under
-    polygons that shine alike in all directions: slices beyond maps of directions, or a `Quadrature` of the model, which
-    takes polygons with a profile and portals too. `None` where there is no such light.
+    that is cut off at the horizon, best fitted above it; `lamps`, which take the place of both under balls and
+    under polygons that shine alike in all directions: slices beyond maps of directions, or a `Quadrature` of the model,
+    which takes polygons with a profile and portals too. `None` where there is no such light.
     """
 
     distant: Slices | BrdfMatrix | None
@@ -54,7 +54,7 @@ class Material(Module):
 
 
 class LocalForms(Module):
-    """The slices of a material above the horizon."""
+    """What stands for a material above the horizon."""
 
     plain: Slices | None
     lamps: TransformedSlices | Quadrature | None

@@ -19,7 +19,10 @@ from shisd.shading._transformed_integrals import integrals, tables_of
 from shisd.shading.slices._slices import Slices, lookup_factors, lookup_table, slice_values
 from shisd.shading.slices._transformed import dense_views
 
-POINTS_TILE = 1024  # pixels at a time, of a material at points: loops of few operations
+
+def tile(form: LampForm) -> int:
+    """Pixels at a time: more of a material at points, whose loops have few operations."""
+    return 1024 if isinstance(form, Quadrature) else 256
 
 
 def above_horizon(

@@ -28,13 +28,12 @@ from shisd.shading._incidence import Y_00, angle_above
 from shisd.shading._material import LocalForms, local_forms
 from shisd.shading._quadrature import Quadrature
 from shisd.shading._tiles import shade_tiles, stacked, sum_lights
-from shisd.shading.paths._cut import POINTS_TILE, above_horizon, at_points, in_frame, integrals_of
+from shisd.shading.paths._cut import above_horizon, at_points, in_frame, integrals_of, tile
 from shisd.shading.paths._path import local_path
 from shisd.shading.slices._slices import Slices, lookup_table, slice_values
 
 Light = PolygonLight | PortalLight
-_TILE = 256  # pixels at a time
-SMALL_TILE = 128  # where every pixel holds the moments about all axes
+SMALL_TILE = 128  # pixels at a time, where every pixel holds the moments about all axes
 
 
 @eqx.filter_jit
@@ -72,10 +71,8 @@ def _shade(
 
         return sum_lights(of_light, stacks, zero)
 
-    if model is not None:
-        size = POINTS_TILE
-    else:
-        size = _TILE if all(product is None for _, product in stacks) else SMALL_TILE
+    alike = all(product is None for _, product in stacks)
+    size = tile(forms.uniform) if alike or model is not None else SMALL_TILE
     return shade_tiles(forms, points, colour, size, of_tile, kinds)
 
 

@@ -17,19 +17,18 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 
-from shisd._numerics import normalize, times
+from shisd._numerics import normalize, tangents, times
 from shisd._typing import Array, Float
 from shisd.domains.internal import cap_coefficients
 from shisd.models import SphereLight
 from shisd.models.internal import versine
 from shisd.shading._material import LampForm, Material, slices_everywhere
-from shisd.shading._quadrature import Quadrature
 from shisd.shading._tiles import shade_tiles, stacked, sum_lights
-from shisd.shading.paths._cut import POINTS_TILE, above_horizon, in_frame, integrals_of
+from shisd.shading.paths._cut import above_horizon, in_frame, integrals_of, tile
 from shisd.shading.paths._path import local_path
 from shisd.shading.slices._slices import Slices, lookup_table, slice_values
 
-_TILE, _SIDES = 256, 12
+_SIDES = 12
 
 
 @eqx.filter_jit
@@ -52,7 +51,7 @@ def _shade(
 
         return sum_lights(of_light, stacks, zero)
 
-    size = 1024 if isinstance(form, Slices) else POINTS_TILE if isinstance(form, Quadrature) else _TILE
+    size = 1024 if isinstance(form, Slices) else tile(form)
     return shade_tiles(form, points, colour, size, of_tile, stacks)
 
 
@@ -84,16 +83,13 @@ def _outline(t: Float[Array, " p"], a: Float[Array, "3 p"]) -> Float[Array, "3 s
     """A regular polygon about a, of the solid angle 2 pi t of a cap: cos(rho) tan(A) = tan(A (1 - t)), A = pi / sides.
 
     Half a side, the center and a corner are a triangle with a right angle, A at the center and B at the corner, where
-    tan(B) = cot(A) / cos(rho); its excess A + B - pi/2 is t A. Its corners follow from a in world space (Duff et al.
-    2017), and so depend on no frame.
+    tan(B) = cot(A) / cos(rho); its excess A + B - pi/2 is t A. Its corners follow from a in world space, and so
+    depend on no frame.
     """
     part = math.pi / _SIDES
     versed = jnp.sin(part * t) / (math.sin(part) * jnp.cos(part * (1 - t)))
     sine = jnp.sqrt(versed * (2 - versed))
-    x, y, z = a
-    side, over = jnp.where(z < 0, -1, 1).astype(z.dtype), 1 / (1 + jnp.abs(z))
-    across = jnp.stack([1 - x * x * over, -x * y * over, -side * x])
-    upon = jnp.stack([-side * x * y * over, side * (1 - y * y * over), -y])
+    across, upon = tangents(a)
     angles = [2 * math.pi * (i + 0.5) / _SIDES for i in range(_SIDES)]
     ring = jnp.stack([across * math.cos(k) + upon * math.sin(k) for k in angles], axis=1)
     return a[:, None] * (1 - versed)[None, None] + ring * sine[None, None]
