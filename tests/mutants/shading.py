@@ -76,6 +76,16 @@ MUTANTS = [
         test=POINTS + "test_radiance_of_the_model[six corners]",
     ),
     Mutant(
+        "a lobe between points is none", "shisd/planning/_paths.py",
+        old="np.where(missed, np.inf, rms(off))", new="rms(off)",
+        test="tests/test_planning.py::test_points_are_chosen_where_they_are_cheapest",
+    ),
+    Mutant(
+        "loops of one point stay one", "shisd/domains/moments/_fold.py",
+        old="np.broadcast_shapes(weights.shape[-1:], points.shape[-1:])", new="points.shape[-1:]",
+        test="tests/test_lanes.py::test_a_batch_of_one_array_of_one_point[fold]",
+    ),
+    Mutant(
         "balls are polygons within them", "shisd/shading/paths/_sphere.py",
         old="versed = jnp.sin(part * t) / (math.sin(part) * jnp.cos(part * (1 - t)))", new="versed = t",
         test=POINTS + "test_balls_are_polygons_of_their_solid_angle",

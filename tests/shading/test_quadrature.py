@@ -52,6 +52,12 @@ def ggx(dtype=np.float64, alpha=ALPHA):
     return models.Ggx(np.asarray(alpha, dtype), np.asarray(0.04, dtype))
 
 
+LIMITS = {  # of the largest radiance, at order 4 and 16
+    "three corners": (5e-3, 2e-11), "four corners": (5e-3, 1.5e-12), "six corners": (5e-3, 1.5e-11),
+    "not convex": (4e-3, 6e-12), "upright": (3e-2, 4e-9),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("name", OUTLINES)
 def test_radiance_of_the_model(name, x64):
     points, geometry = OUTLINES[name], scene()
@@ -60,8 +66,7 @@ def test_radiance_of_the_model(name, x64):
         np.max(np.abs(shade(shading.Quadrature(ggx(), order), models.PolygonLight(points), geometry) - want))
         for order in (4, 16)
     ]
-    limits = np.array([3e-2, 3e-9] if name == "upright" else [5e-3, 1e-11])
-    assert np.max(want) > 1e-3 and np.all(errors < limits * np.max(want)), errors
+    assert np.max(want) > 1e-3 and np.all(errors < np.array(LIMITS[name]) * np.max(want)), errors
 
 
 @FLOAT64_FIRST
@@ -96,11 +101,11 @@ def test_materials_take_it_under_all_local_lights(rng):
         assert np.max(got) > 1e-3
 
 
-BALLS = [([0.4, 0.3, 1.5], 0.3), ([0, 0, 1], 0.6), ([1, 0, 0.2], 0.5)]
+BALLS = [([0.4, 0.3, 1.5], 0.3, 1.5e-5), ([0, 0, 1], 0.6, 1e-4), ([1, 0, 0.2], 0.5, 5e-4)]
 
 
-@pytest.mark.parametrize("center, radius", BALLS)
-def test_balls_are_polygons_of_their_solid_angle(center, radius, x64):
+@pytest.mark.parametrize("center, radius, error", BALLS)
+def test_balls_are_polygons_of_their_solid_angle(center, radius, error, x64):
     """A white surface, wholly lit, receives pi sin^2 of the half angle times the cosine; anything, from quadrature."""
     positions = np.array([[0, 0, 0.0], [0.3, -0.2, 0], [-0.5, 0.1, 0]])
     geometry = positions, np.tile([0, 0, 1.0], (3, 1)), unit(np.array([[1.0, 0, 1], [0, 0.3, 1], [-2, 1, 1]]))
@@ -110,7 +115,7 @@ def test_balls_are_polygons_of_their_solid_angle(center, radius, x64):
     above = away[:, 2] > radius
     white = shade(shading.Quadrature(models.Lambertian(np.float64(1)), 6), light, geometry)
     lit = (radius / distance) ** 2 * away[:, 2] / distance
-    np.testing.assert_allclose(white[above], lit[above], rtol=1e-4)
+    np.testing.assert_allclose(white[above], lit[above], rtol=error)
     turns = 2 * np.pi * (np.arange(400) + 0.5) / 400
     x, weight = np.polynomial.legendre.leggauss(300)
     want = []
@@ -124,7 +129,7 @@ def test_balls_are_polygons_of_their_solid_angle(center, radius, x64):
         size = (radius / d) ** 2 / (1 + np.sqrt(1 - (radius / d) ** 2)) * np.pi / 400
         want.append(np.einsum("st,s->", truth.ggx_cosine(w, view, ALPHA), weight) * size)
     got = shade(shading.Quadrature(ggx(), 16), light, geometry)
-    np.testing.assert_allclose(got, want, atol=5e-4 * np.max(want))
+    np.testing.assert_allclose(got, want, atol=error * np.max(want))
 
 
 def test_inside_a_ball_light_is_all_around(x64):
@@ -132,11 +137,11 @@ def test_inside_a_ball_light_is_all_around(x64):
     geometry = tuple(a[:3] for a in scene())
     light = models.SphereLight(np.zeros(3), 2.0)
     white = shade(shading.Quadrature(models.Lambertian(np.float64(1)), 8), light, geometry)
-    np.testing.assert_allclose(white, 1, rtol=1e-3)
+    np.testing.assert_allclose(white, 1, rtol=5e-5)
     c = np.zeros((8, 4))
     c[:, 2] = np.sqrt(4 * np.pi / 3) / np.pi
     beyond = shading.TransformedSlices(np.zeros((8, 5)), c, np.zeros((8, 9)))
-    np.testing.assert_allclose(shade(beyond, light, geometry), 1, rtol=1e-12)
+    np.testing.assert_allclose(shade(beyond, light, geometry), 1, rtol=2e-15)
 
 
 def test_derivatives_in_everything(x64, rng):
@@ -157,7 +162,7 @@ def test_derivatives_in_everything(x64, rng):
         ends = [both(*(a + t * move if k == i else a for k, a in enumerate(arguments)))[0] for t in (1e-5, -1e-5)]
         want = (ends[0] - ends[1]) / 2e-5
         assert abs(want) > 1e-4
-        np.testing.assert_allclose(np.sum(np.asarray(slope) * move), want, rtol=1e-6, atol=1e-9, err_msg=str(i))
+        np.testing.assert_allclose(np.sum(np.asarray(slope) * move), want, rtol=6e-9, err_msg=str(i))
 
 
 def test_errors_name_the_argument(as_user):
