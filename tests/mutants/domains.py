@@ -44,6 +44,11 @@ MUTANTS = [
         test=f"{_CASE}[edge 1e-03 rad short of pi]",
     ),
     Mutant(
+        "a sign that roundings choose", _RECURRENCE,
+        old="dot(_leading(d), _leading(c)) < 0", new="dot(d, c) < 0",
+        test="tests/domains/test_moments.py::test_values_and_derivatives_as_users_compile_them",
+    ),
+    Mutant(
         "a sum of ends where they cancel", _RECURRENCE,
         old="dot(edge.middle, d), dot(edge.normal, d)", new="u0 + u1, dot(edge.normal, d)",
         test=f"{_CASE}[edge 1e-03 rad short of pi]",
