@@ -12,19 +12,22 @@ one end of the light is near and the other far.
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from shisd import _checks
 from shisd._module import Module
-from shisd._numerics import dot, times
+from shisd._numerics import cross, dot, times
 from shisd._typing import Array, Float
 from shisd.domains.internal import Loop, on_sphere
 from shisd.models import AbstractBrdf
 
+Inputs = TypeVar("Inputs")
 Patch = tuple[Array, Array, Array, Array]  # a component of x at (0, 0), its changes with u and v, and with both
 
 
@@ -36,6 +39,10 @@ class Quadrature(Module):
     It stands in a `Material` as `lamps`, or goes to `shade` as it is. The error is that of the rule: it falls
     exponentially with the order, the slower the sharper the lobe and the nearer the light. There is no other: nothing
     is expanded, and nothing tabulated.
+    Derivatives: in the light's points, positions and frames that of the integral, as the model at points of the edges;
+    it has an error of its own, smaller than that of the rule's derivative (a wall that the horizon cuts, alpha 0.5,
+    order 4: 8e-3 for 1.6e-1). In views and the model, that of the rule. All orders, both modes. A gradient in
+    everything takes 3.5 times the value.
     """
 
     brdf: AbstractBrdf
@@ -59,18 +66,71 @@ def reflected(material: Quadrature, view: Float[Array, "p 3"], w: Float[Array, "
     return jax.vmap(material.brdf.value_cosine, (1, 0), -1)(w, view)
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 3, 4))
 def integrate(
-    function: Callable[[Float[Array, "3 p"]], Float[Array, "*colour p"]],
+    function: Callable[[Inputs, Float[Array, "3 p"]], Float[Array, "*colour p"]],
+    inputs: Inputs,
     v: Loop,
     order: int,
-    total: Array,
-    *,
-    center: bool = False,
+    center: bool,
 ) -> Float[Array, "*colour p"]:
-    """`total` and the integral of function(w) over every loop of unit vertices, in a fan from the first of them.
+    """The integral of function(inputs, w) over every loop of unit vertices, in a fan from the first of them.
 
-    Or from a direction amid them, which outlines up to the whole hemisphere need.
+    Or, with `center`, from a direction amid them, which outlines up to the whole hemisphere need.
     """
+    return _over_area(functools.partial(function, inputs), v, order, center)
+
+
+def _integrate_jvp(function: Callable, order: int, center: bool, primals: tuple, tangents: tuple):
+    """In the inputs that of the rule. In the vertices that of the integral: the function, where the edges go.
+
+    What an edge a + t (b - a) sweeps is f (dx . (a x b)) / |x|^3 dt, outwards of the loop with the other sign.
+    """
+    (inputs, v), (d_inputs, dv) = primals, tangents
+    leaves, form = jax.tree.flatten(inputs)
+    moves = {i: d for i, d in enumerate(jax.tree.leaves(d_inputs)) if not isinstance(d, SymbolicZero)}
+
+    def area(moved: dict[int, Array]) -> Array:
+        inputs = form.unflatten([moved.get(i, leaf) for i, leaf in enumerate(leaves)])
+        return _over_area(functools.partial(function, inputs), v, order, center)
+
+    value, change = jax.jvp(area, ({i: leaves[i] for i in moves},), (moves,))
+    if not isinstance(dv, SymbolicZero):
+        change = change + _swept(functools.partial(function, inputs), v, dv, order)
+    return value, change
+
+
+integrate.defjvp(_integrate_jvp, symbolic_zeros=True)
+
+
+def _swept(function: Callable, v: Loop, dv: Loop, order: int) -> Float[Array, "*colour p"]:
+    """- integral of f(x / |x|) dx . (a x b) / |x|^3 dt over all edges x = a + t (b - a)."""
+    a, b, da, db = v, jnp.roll(v, -1, 1), dv, jnp.roll(dv, -1, 1)
+    normal = cross(a, b)
+    t, weight = np.polynomial.legendre.leggauss(order)
+    rule = jnp.asarray(np.stack([(t + 1) / 2, weight / 2], axis=1), v.dtype)
+    start, end = dot(normal, da), dot(normal, db)  # [s, p]
+    edges = [jnp.moveaxis(x, -2, 0) for x in (a, b - a, start, end - start)]
+    shape = jax.eval_shape(function, v[:, 0]).shape
+
+    def of_edge(total, edge):
+        a, chord, start, change = edge
+
+        def node(total, row):
+            t, weight = row
+            x = a + t * chord
+            square = dot(x, x)
+            over = jax.lax.rsqrt(square)
+            return total - times(function(x * over[None]), weight * (start + t * change) * over / square), None
+
+        return jax.lax.scan(node, total, rule)[0], None
+
+    return jax.lax.scan(of_edge, jnp.zeros(shape, v.dtype), edges)[0]
+
+
+def _over_area(
+    function: Callable[[Float[Array, "3 p"]], Float[Array, "*colour p"]], v: Loop, order: int, center: bool
+) -> Float[Array, "*colour p"]:
     slots = v.shape[1]
     if center:
         first = np.arange(1, slots + 1, 2)
@@ -101,6 +161,7 @@ def integrate(
         used = functools.reduce(jnp.logical_or, [jnp.any(x != 0) for row in patch for x in row[1:]])
         return jax.lax.cond(used, nodes, lambda total, _: total, total, patch), None
 
+    total = jnp.zeros(jax.eval_shape(function, v[:, 0]).shape, v.dtype)
     return jax.lax.scan(of_patch, total, patches)[0]
 
 

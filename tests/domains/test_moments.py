@@ -24,6 +24,7 @@ WEIGHTS = np.cos(np.arange(AXES * (DEGREE + 1))).reshape(AXES, -1)
 CASES = {name: (v, axes_for(v, np.random.default_rng(7))) for name, v in (POLYGONS | HALF_TURNS | TINY).items()}
 CASES |= {name: (v, np.tile(d, (AXES, 1))) for name, (v, d) in AXES_AT_POLYGONS.items()}
 
+
 @eqx.filter_jit
 def evaluated(vertices, axes, weights):
     """Of all moments to degree 40 a weighted sum's gradients in vertices and axes, and the moments."""

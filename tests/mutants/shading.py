@@ -66,6 +66,11 @@ MUTANTS = [
         old="whole, lambda: in_lanes(clip, (outline, above)))", new="whole, whole)", test=SLICE,
     ),
     Mutant(
+        "what an edge sweeps as if it did not turn", "shisd/shading/_quadrature.py",
+        old="weight * (start + t * change)", new="weight * (start + change / 2)",
+        test="tests/shading/test_quadrature.py::test_derivatives_in_everything",
+    ),
+    Mutant(
         "patches are flat", "shisd/shading/_quadrature.py",
         old="d - a, (a - b) - (d - c))", new="d - a, 0 * a)",
         test=POINTS + "test_radiance_of_the_model[six corners]",

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from shisd._lanes import in_lanes
 from shisd._numerics import dot, times
@@ -61,16 +60,16 @@ def at_points(
     material: Quadrature, local: Array, light: tuple[Array, Array] | None, v: Loop, _: int, *, center: bool = False
 ) -> Float[Array, "*colour p"]:
     """Integrals of the model itself, times `light`: frames, and coefficients in world space."""
+    return integrate(_at_point, (material, local, light), v, material.order, center)
 
-    def function(w: Float[Array, "3 p"]) -> Float[Array, "*colour p"]:
-        values = reflected(material, local, w)
-        if light is None:
-            return values
-        frame, incident = light
-        return times(values, evaluate(incident[..., None, :], jnp.einsum("pij,jp->pi", frame, w)))
 
-    colour = material.colour if light is None else np.broadcast_shapes(material.colour, light[1].shape[:-1])
-    return integrate(function, v, material.order, jnp.zeros((*colour, v.shape[2]), v.dtype), center=center)
+def _at_point(inputs: tuple[Quadrature, Array, tuple[Array, Array] | None], w: Float[Array, "3 p"]) -> Array:
+    material, local, light = inputs
+    values = reflected(material, local, w)
+    if light is None:
+        return values
+    frame, incident = light
+    return times(values, evaluate(incident[..., None, :], jnp.einsum("pij,jp->pi", frame, w)))
 
 
 def _uniform(slices: Slices, table: Array, local: Array, v: Loop, spare: int) -> Float[Array, "*colour p"]:
