@@ -178,7 +178,7 @@ def test_errors_are_those_of_the_worst_colour(rng):
     light = Distant(e, True)
     energy = shares @ np.add.reduceat(slices[0] ** 2, np.arange(7) ** 2, axis=-1)
     red = energy * [1, 0, 0, 0, 0, 0, 13] / (2 * np.arange(7) + 1)
-    material = Material(slices, shares, False, True, 4, MATERIALS["clay"])
+    material = Material(slices, np.zeros(3), shares, False, True, 4, MATERIALS["clay"])
     for degree, expected in ((5, np.sqrt(red[6] / np.sum(red))), (6, 0.0)):
         np.testing.assert_allclose(judge(Table, material, light, degree).error, expected, rtol=1e-12)
 
@@ -204,6 +204,23 @@ def test_points_are_chosen_where_they_are_cheapest(rng):
     assert 0.6 < error / entry.error < 1.6 and error < 0.03
     mirror = known_material(models.Phong(1.0, 1e9), 16, 4)
     assert judge(Points, mirror, known_light("lamp", lamp, scene().points, 16), 16).error > 1
+
+
+def test_light_is_filtered_where_a_table_costs_more(rng):
+    """For a narrower lobe, two lights together; the cost is that of the maps."""
+    lights, brdf = {name: scene().lights[name] for name in ("room", "sky")}, models.Ggx(0.25, 0.3)
+    made = planning.plan(planning.Scene({"it": brdf}, lights), 0.03, max_degree=16)
+    first, second = made.entries
+    assert first.path == second.path == "filtered" and second.joined == "room" and made.status == Status.ok
+    filtered = made.paths["it"][0].filtered
+    assert 0 < filtered.error < 0.6 * first.error and first.cost == 1000 + 20 * 3 * np.count_nonzero(
+        np.any(np.asarray(filtered.expand), axis=1)
+    )
+    _, n, v = where = pixels(rng, 512)
+    truth = sum(reference.shade_environment_quadrature(brdf, light, n, v) for light in lights.values())
+    mean = lambda x: np.mean(np.square(x), axis=0)
+    error = np.max(np.sqrt(mean(made.shade("it", surface(*where)) - truth) / mean(truth)))
+    assert 0.2 < error / first.error < 1 and error < 0.03, (error, first.error)  # both lights beside one
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ class Material:
     """Slices of a material from some sides."""
 
     coefficients: np.ndarray  # [C, V, n], C = 1 without colour
+    theta: np.ndarray  # [V], elevations
     shares: np.ndarray  # [V], how much of the picture of a sphere is seen so; their sum is 1
     coloured: bool
     isotropic: bool
@@ -150,7 +151,7 @@ def known_material(brdf: AbstractBrdf, degree: int, elevations: int) -> Material
     c = np.asarray(_slices(brdf, jnp.asarray(local, float), degree), float)  # [V, *colour, n]
     shares = np.repeat(weights, len(azimuths)) * np.sin(2 * theta)
     coefficients = np.moveaxis(c.reshape(len(theta), -1, c.shape[-1]), 0, 1)
-    return Material(coefficients, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, elevations, brdf)
+    return Material(coefficients, theta, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, elevations, brdf)
 
 
 @eqx.filter_jit

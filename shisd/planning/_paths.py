@@ -16,8 +16,8 @@ from shisd.decomposition import fibonacci_directions
 from shisd.harmonics import convolve, evaluate
 from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
 from shisd.planning._bands import Distant, Local, Material, predict
-from shisd.shading import Quadrature, Slices, Surface, shade
-from shisd.shading.internal import as_type, finite_mark, finite_or_nan, shade_points
+from shisd.shading import Prefiltered, Quadrature, Slices, Surface, prefilter, shade
+from shisd.shading.internal import as_type, best_channels, finite_mark, finite_or_nan, maps_of, shade_points
 
 _ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
 _EXACT = 24  # the order that others are compared with
@@ -157,6 +157,49 @@ class Table(Expanded):
         return shade(self.slices, self.light, surface)
 
 
+class Filtered(Expanded):
+    """Distant light filtered for the material beforehand.
+
+    What the bands up to `degree` leave out and what the channels do are of unlike kind: their squares add up, to 25/16
+    of the first with channels to 3/4 of it.
+    """
+
+    name = "filtered"
+    takes = DistantLight
+    filtered: Prefiltered
+
+    left_out = Table.left_out
+
+    @classmethod
+    def errors(cls, material, light, degree):
+        if not material.isotropic:
+            nothing = np.zeros(max(material.colours, light.colours))
+            return nothing + np.inf, nothing + np.inf, nothing + 1
+        error, bound, radiance = super().errors(material, light, degree)
+        return 5 / 4 * error, 5 / 4 * bound, radiance
+
+    @classmethod
+    def cost(cls, material, light, degree):
+        n = (degree + 1) ** 2
+        c, e = material.coefficients[..., :n], light.coefficients[:, :n]
+        orders = best_channels(c, e, material.theta, material.shares, cls.tolerance(material, [light], degree))[1]
+        return 1000.0 + 20 * max(material.colours, light.colours) * maps_of(orders)
+
+    @classmethod
+    def tolerance(cls, material, lights, degree) -> float:
+        """Of the channels."""
+        errors = [np.max(error / radiance) for error, _, radiance in (cls.errors(material, x, degree) for x in lights)]
+        return max(3 / 5 * float(max(errors)), 1e-3)
+
+    @classmethod
+    def make(cls, material, slices, lights, degree):
+        light = DistantLight(_sum(lights, degree))
+        return cls(prefilter(slices.cut(degree), light, tolerance=cls.tolerance(material, lights, degree)))
+
+    def shade(self, surface):
+        return self.filtered.radiance(surface)
+
+
 class AboveHorizon(Expanded):
     """A local light above the horizon, where alone the slices are fitted."""
 
@@ -242,7 +285,7 @@ class PortalPoints(Points):
     takes = PortalLight
 
 
-PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Polygon, Portal, Points, PortalPoints)
+PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Filtered, Polygon, Portal, Points, PortalPoints)
 
 
 @functools.lru_cache(maxsize=1)  # the orders of one pair follow each other

@@ -1,4 +1,4 @@
-"""A path at a degree, judged: its error relative to the radiance, for the worst colour, and its cost."""
+"""A path at a degree, judged: its error relative to the radiance, for the worst colour."""
 
 from typing import NamedTuple
 
@@ -11,13 +11,15 @@ _DARK = 1e-6  # of the brightest colour's radiance: a colour below it is roundin
 
 
 class Choice(NamedTuple):
-    """A path at a degree, with its relative RMS error, the bound on it and its cost, as in `Entry`."""
+    """A path at a degree, with its relative RMS error and the bound on it, as in `Entry`."""
 
     path: type[Path]
     degree: int
     error: float
     bound: float
-    cost: float
+
+    def cost(self, material: Material, light: Seen) -> float:
+        return self.path.cost(material, light, self.degree)
 
     def name(self, material: Material) -> str:
         if self.path is not Table:
@@ -30,4 +32,4 @@ def judge(path: type[Path], material: Material, light: Seen, degree: int) -> Cho
     error, bound, radiance = path.errors(material, light, degree)
     dark = radiance <= _DARK * np.max(radiance)
     relative = lambda x: float(np.max(np.where(dark, 0, x / np.where(dark, 1, radiance))))
-    return Choice(path, degree, relative(error), relative(bound), path.cost(material, light, degree))
+    return Choice(path, degree, relative(error), relative(bound))

@@ -135,18 +135,10 @@ def prefilter(
 
 
 def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> Prefiltered:
-    """The centre that needs fewer maps to meet the tolerance, and its channels; no tables yet."""
-    degree = _checks.degree_of(c.shape[-1])
+    """The channels, and the centre with which they are fewest; no tables yet."""
+    degree, views = _checks.degree_of(c.shape[-1]), c.shape[1]
     e = e.reshape(-1, e.shape[-1])
-    l = np.arange(degree + 1)
-    energy = np.add.reduceat(e * e, l**2, axis=1) / (2 * l + 1)
-    swaps, slices = jnp.asarray(_swaps(degree), float), jnp.asarray(c, float)
-    found = []
-    for mirror in (False, True):
-        centred = np.asarray(_centred(slices, jnp.asarray(mirror), swaps), float)
-        orders, *rest = _channels(centred[:, degree:], energy, _shares(c.shape[1]), tolerance)
-        found.append((len(orders) + np.count_nonzero(orders), mirror, orders, *rest))
-    _, mirror, m, reduce, expand = min(found, key=lambda x: x[0])
+    mirror, m, reduce, expand = best_channels(c, e, _views.elevations(views), _shares(views), tolerance)
     turning = np.flatnonzero(m > 0)  # these have a V
     order, reduce, expand = (np.concatenate([x, y[turning]]) for x, y in ((m, -m), (reduce, reduce), (expand, expand)))
     pad = lambda x: np.pad(x, ((0, -len(x) % 8), *[(0, 0)] * (x.ndim - 1)))
@@ -164,6 +156,34 @@ def _choose(c: np.ndarray, e: np.ndarray, tolerance: float) -> Prefiltered:
         highest=highest,
         colours=((), ()),
     )
+
+
+def best_channels(
+    c: Float[np.ndarray, "s v n"],
+    e: Float[np.ndarray, "s2 n"],
+    theta: Float[np.ndarray, " v"],
+    shares: Float[np.ndarray, " v"],
+    tolerance: float,
+) -> tuple[bool, np.ndarray, np.ndarray, np.ndarray]:
+    """Whether slices at elevations `theta` are centred about the mirror direction, which takes fewer maps or not.
+
+    And orders, `reduce` and `expand` of the channels.
+    """
+    degree = _checks.degree_of(c.shape[-1])
+    l = np.arange(degree + 1)
+    energy = np.add.reduceat(e * e, l**2, axis=1) / (2 * l + 1)
+    swaps, slices = jnp.asarray(_swaps(degree), float), jnp.asarray(c, float)
+    found = []
+    for mirror in (False, True):
+        centred = np.asarray(_centred(slices, jnp.asarray(theta, float), jnp.asarray(mirror), swaps), float)
+        orders, *rest = _channels(centred[:, degree:], energy, shares, tolerance)
+        found.append((mirror, orders, *rest))
+    return min(found, key=lambda x: maps_of(x[1]))
+
+
+def maps_of(orders: np.ndarray) -> int:
+    """Of channels of these orders: U, and V but for order 0."""
+    return len(orders) + int(np.count_nonzero(orders))
 
 
 def _channels(
@@ -212,11 +232,13 @@ def _shares(views: int) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _centred(c: Float[Array, "s v n"], mirror: bool | Array, swaps: Float[Array, "l m m"]) -> Float[Array, "l m s v"]:
+def _centred(
+    c: Float[Array, "s v n"], theta: Float[Array, " v"], mirror: bool | Array, swaps: Float[Array, "l m m"]
+) -> Float[Array, "l m s v"]:
     """Coefficients of slices in frames whose z axis is the centre, and whose x axis points to the normal's side."""
     degree = len(swaps) - 1
     order = np.arange(-degree, degree + 1)[:, None, None]
-    angle = jnp.where(mirror, jnp.asarray(order * _views.elevations(c.shape[1]), c.dtype), 0)  # [m, 1, v]
+    angle = jnp.where(mirror, jnp.asarray(order, c.dtype) * theta[None, None], 0)  # [m, 1, v]
     x = jnp.einsum("lkm,svlm->lksv", swaps, by_band(c, degree))
     x = jnp.cos(angle)[None] * x + jnp.sin(angle)[None] * x[:, ::-1]  # Ry(theta) is J Z(-theta) J
     return jnp.einsum("lmk,lksv->lmsv", swaps, x)
@@ -241,7 +263,8 @@ def _filter(
 ) -> dict[str, Array]:
     """`profiles`, `maps` and `error` of `Prefiltered`."""
     m = jnp.abs(like.order)
-    centred = _centred(c, like.mirror, swaps)
+    theta = jnp.asarray(_views.elevations(c.shape[1]), c.dtype)
+    centred = _centred(c, theta, like.mirror, swaps)
     a = jnp.einsum("al,lasv->sav", like.reduce, centred[:, like.degree + m])
     profiles = jnp.moveaxis(_views.spline_table(a, m), -1, 0).swapaxes(1, 2)  # [V+4, maps, s]
     error = _error(centred[:, like.degree :], a, e, like)

@@ -1,5 +1,7 @@
 """What planning takes from inside shading: slices before they are tables, batches of points, sums of radiance."""
 
+from shisd.shading._prefiltered import best_channels as best_channels
+from shisd.shading._prefiltered import maps_of as maps_of
 from shisd.shading._surface import check_surface as check_surface
 from shisd.shading._tiles import as_type as as_type
 from shisd.shading._tiles import finite_mark as finite_mark
