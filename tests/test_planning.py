@@ -181,6 +181,9 @@ def test_errors_are_those_of_the_worst_colour(rng):
     material = Material(slices, np.zeros(3), shares, False, True, 4, MATERIALS["clay"])
     for degree, expected in ((5, np.sqrt(red[6] / np.sum(red))), (6, 0.0)):
         np.testing.assert_allclose(judge(Table, material, light, degree).error, expected, rtol=1e-12)
+    blue = 9 * energy[0] + 9 * energy[1]
+    together = judge(Table, material, light, 5, pooled=True).error
+    np.testing.assert_allclose(together, np.sqrt(1e-4 * red[6] / (1e-4 * np.sum(red) + blue)), rtol=1e-12)
 
 
 def test_what_cannot_be_met_is_said():

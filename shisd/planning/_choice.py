@@ -1,5 +1,6 @@
 """The choice: for each material and light the cheapest path at the smallest degree, as a table and as what shades."""
 
+import functools
 import warnings
 from collections.abc import Callable
 from typing import NamedTuple
@@ -21,10 +22,12 @@ from shisd.planning._scene import Scene
 from shisd.shading import Surface, tabulate_brdf
 from shisd.shading.internal import as_type, check_surface, sum_parts
 
+Judge = Callable[[type[Path], Material, Seen, int], Choice]
+
 
 class Entry(NamedTuple):
     """The decision for one material and one light. Errors are relative to the RMS radiance of this pair, of the colour
-    for which they are largest.
+    for which they are largest, or of all colours together.
     """
 
     material: str
@@ -88,15 +91,17 @@ def plan(
     max_degree: int = 30,
     margin: float = 1.5,
     elevations: int = 64,
+    pooled: bool = False,
     throw: bool = True,
     progress: Progress = None,
 ) -> Plan:
     """For each material and light of a scene, the cheapest path and the smallest degree that meet a tolerance.
 
     Arguments: `tolerance` > 0, the relative RMS error: of the radiance from one light, over its RMS, both over normals
-    in all directions and views as in the picture of a sphere; every colour has to meet it. Static `max_degree` up to
-    64; `margin` >= 1, by which predictions are multiplied before they are compared: real scenes are not turned in all
-    ways. `elevations` of the tables, as in `shading.tabulate_brdf`.
+    in all directions and views as in the picture of a sphere; every colour has to meet it, or with `pooled` the sum of
+    their squares, which a dim colour hardly changes. Static `max_degree` up to 64; `margin` >= 1, by which predictions
+    are multiplied before they are compared: real scenes are not turned in all ways. `elevations` of the tables, as in
+    `shading.tabulate_brdf`.
     Distant lights that take the same path are added up before it, so only the first of them costs anything, and others
     join where they meet the tolerance there.
     Distant light may be filtered beforehand (`shading.prefilter`, isotropic materials): 1 to 3 s more for each such
@@ -124,7 +129,7 @@ def plan(
     if margin < 1:
         raise ValueError(f"`margin` must be >= 1; got {margin}.")
     with reporting(progress, len(scene.lights) + len(scene.materials), "plan") as step:
-        made = _plan(scene, tolerance, margin, max_degree, elevations, step)
+        made = _plan(scene, tolerance, margin, max_degree, elevations, pooled, step)
     if made.status != Status.ok:
         failed = [f"{e.material} under {e.light} ({100 * e.error:.2g} %)" for e in made.entries if not e.met]
         message = (
@@ -138,9 +143,16 @@ def plan(
 
 
 def _plan(
-    scene: Scene, tolerance: float, margin: float, max_degree: int, elevations: int, step: Callable[..., object]
+    scene: Scene,
+    tolerance: float,
+    margin: float,
+    max_degree: int,
+    elevations: int,
+    pooled: bool,
+    step: Callable[..., object],
 ) -> Plan:
     reference = max(32, 2 * max_degree)
+    judged = functools.partial(judge, pooled=pooled)
     lights = {}
     for name, light in scene.lights.items():
         lights[name] = known_light(name, light, scene.points, reference)
@@ -148,8 +160,8 @@ def _plan(
     entries, paths = [], {}
     for name, brdf in scene.materials.items():
         material = known_material(brdf, reference, elevations)
-        choices = {of: _choose(material, light, tolerance / margin, max_degree) for of, light in lights.items()}
-        choices, hosts = _join(material, lights, choices, tolerance / margin)
+        choices = {of: _choose(judged, material, light, tolerance / margin, max_degree) for of, light in lights.items()}
+        choices, hosts = _join(judged, material, lights, choices, tolerance / margin)
         needed = [choice.degree for choice in choices.values() if issubclass(choice.path, Expanded)]
         slices = as_type(tabulate_brdf(brdf, max(needed), elevations=elevations), float) if needed else None
         for of, choice in choices.items():
@@ -168,27 +180,29 @@ def _plan(
     return Plan(tuple(entries), tolerance, paths)
 
 
-def _choose(material: Material, light: Seen, target: float, max_degree: int) -> Choice:
+def _choose(judged: Judge, material: Material, light: Seen, target: float, max_degree: int) -> Choice:
     """The cheapest path that meets the target, or else the one that comes closest."""
     found = []
     for path in PATHS:
         if path.takes is light.kind:
-            found.append(_first(path, material, light, target, max_degree))
+            found.append(_first(judged, path, material, light, target, max_degree))
     good = [choice for choice in found if choice.error <= target]
     return min(good, key=lambda c: c.cost(material, light)) if good else min(found, key=lambda c: c.error)
 
 
-def _first(path: type[Path], material: Material, light: Seen, target: float, max_degree: int) -> Choice:
+def _first(
+    judged: Judge, path: type[Path], material: Material, light: Seen, target: float, max_degree: int
+) -> Choice:
     """A path at the first degree that meets the target, or at the last."""
     for degree in path.degrees(max_degree):
-        choice = judge(path, material, light, degree)
+        choice = judged(path, material, light, degree)
         if choice.error <= target:
             break
     return choice
 
 
 def _join(
-    material: Material, lights: dict[str, Seen], choices: dict[str, Choice], target: float
+    judged: Judge, material: Material, lights: dict[str, Seen], choices: dict[str, Choice], target: float
 ) -> tuple[dict[str, Choice], dict[str, str]]:
     """Distant lights in the paths of others, where they are good enough; and whose path, for each light."""
     hosts = {name: name for name in choices}
@@ -199,7 +213,7 @@ def _join(
             host = max(takers, key=lambda name: choices[name].degree)
             for name in free:
                 if lights[name].kind is path.takes:
-                    joined = judge(path, material, lights[name], choices[host].degree)
+                    joined = judged(path, material, lights[name], choices[host].degree)
                     if name in takers or joined.error <= target:
                         choices, hosts = choices | {name: joined}, hosts | {name: host}
             free = [name for name in free if hosts[name] != host]

@@ -1,4 +1,4 @@
-"""A path at a degree, judged: its error relative to the radiance, for the worst colour."""
+"""A path at a degree, judged: its error relative to the radiance, for the worst colour or of all together."""
 
 from typing import NamedTuple
 
@@ -27,9 +27,11 @@ class Choice(NamedTuple):
         return f"{'isotropic' if material.isotropic else 'anisotropic'} {self.path.name}"
 
 
-def judge(path: type[Path], material: Material, light: Seen, degree: int) -> Choice:
-    """A path at a degree, by the colour for which its error is largest."""
+def judge(path: type[Path], material: Material, light: Seen, degree: int, *, pooled: bool = False) -> Choice:
+    """A path at a degree, by the colour for which its error is largest, or `pooled` by the sum of squares of all."""
     error, bound, radiance = path.errors(material, light, degree)
+    if pooled:
+        error, bound, radiance = (np.sqrt(np.sum(np.square(x), keepdims=True)) for x in (error, bound, radiance))
     dark = radiance <= _DARK * np.max(radiance)
     relative = lambda x: float(np.max(np.where(dark, 0, x / np.where(dark, 1, radiance))))
     return Choice(path, degree, relative(error), relative(bound))

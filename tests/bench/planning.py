@@ -5,7 +5,8 @@ import numpy as np
 
 from shisd import Status, models, planning, reference, shading
 from shisd.planning._bands import known_light, known_material
-from shisd.planning._paths import Polygon, Table
+from shisd.planning._choice import _choose
+from shisd.planning._paths import Expanded, Polygon, Table
 from shisd.planning._prediction import judge
 from tests.bench.lobes import load_map
 from tests.bench.timing import interleaved
@@ -64,6 +65,9 @@ def relative(got, truth):
 def truth_of(brdf, light, where):
     if isinstance(light, models.Environment):
         return np.asarray(reference.shade_environment_quadrature(brdf, light, *where[1:]))
+    if isinstance(light, models.PortalLight):  # at more points than any plan takes
+        finest = shading.Quadrature(brdf, 32)
+        return np.asarray(shading.shade(finest, light, shading.Surface(*where[1:], where[0])))
     return np.asarray(reference.shade_polygon_quadrature(brdf, light.points, light.emission, *where, nodes=24))
 
 
@@ -107,6 +111,90 @@ def bench_prediction(degrees=(4, 8, 16), count=1024, names=("interior", "studio"
                 })  # fmt: skip
                 print(rows[-1], flush=True)
     return rows
+
+
+def eight_materials():
+    more = {
+        "GGX 0.5": models.Ggx(0.5, 0.04), "GGX 0.3": models.Ggx(0.3, 0.5), "GGX 0.2": models.Ggx(0.2),
+        "Phong 40": models.Phong(np.array([0.4, 0.5, 0.3]), 40.0, 0.2),
+    }  # fmt: skip
+    return materials() | more
+
+
+def eight_lights():
+    """Three photographed maps of other colours or a sun, a gradient, and lamps: overhead, small, upright, a window."""
+    sun = models.Environment.from_function(sun_and_sky, HEIGHT)
+    low = LAMP @ np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)  # across the horizon of most points
+    room = small_map("interior").light(4).coefficients
+    return {
+        "interior": small_map("interior"),
+        "studio": small_map("studio"),
+        "sun": sun,
+        "sky": sky(),
+        "lamp": models.PolygonLight(LAMP, np.float32([3, 2, 1])),
+        "small lamp": models.PolygonLight(LAMP * np.float32([0.3, 0.3, 0.6]), np.float32(30)),
+        "upright": models.PolygonLight(low, np.float32([1, 2, 3])),
+        "window": models.PortalLight(LAMP[:3], room),
+    }
+
+
+def sun_and_sky(w):
+    """A sun as wide as a few texels, 50 times as bright as a sky that darkens downwards."""
+    toward = jnp.asarray(unit(np.array([0.4, -0.5, 0.77])), w.dtype)
+    disc = 50 * jnp.exp(300 * (w @ toward - 1))
+    return disc[:, None] * jnp.asarray([[1.0, 0.9, 0.8]], w.dtype) + (1 + w[:, 2:]) * jnp.asarray(
+        [[0.3, 0.5, 0.8]], w.dtype
+    )
+
+
+def bench_tolerances(tolerances=(0.1, 0.03, 0.01), count=1024, max_degree=30):
+    """Whether plans keep what they promise: eight materials, eight lights, three tolerances, each pair by itself.
+
+    `kept`: of those that are met by prediction. Predicted over measured: the middle and the ends of the middle 95 %, of
+    errors above a thirtieth of the tolerance, which the reference resolves. Of the worst colour; pixels are turned in
+    all ways; measured against quadrature of the material itself.
+    """
+    where = pixels(count)
+    points = jnp.asarray(where[0][::80])
+    reference_degree = max(32, 2 * max_degree)
+    seen = {name: known_light(name, light, points, reference_degree) for name, light in eight_lights().items()}
+    found = []
+    for material, brdf in eight_materials().items():
+        known = known_material(brdf, reference_degree, 64)
+        for name, light in eight_lights().items():
+            truth = truth_of(brdf, light, where)
+            for tolerance in tolerances:
+                chosen = _choose(judge, known, seen[name], tolerance / 1.5, max_degree)
+                expanded = issubclass(chosen.path, Expanded)
+                slices = shading.tabulate_brdf(brdf, chosen.degree, throw=False) if expanded else None
+                path = chosen.path.make(known, slices, [seen[name]], chosen.degree)
+                measured = worst_colour(path.shade(shading.Surface(*where[1:], where[0])), truth)
+                found.append((tolerance, chosen.path.name, chosen.error, measured))
+                print(material, name, *found[-1], flush=True)
+    return [kept(tolerance, [x[1:] for x in found if x[0] == tolerance]) for tolerance in tolerances]
+
+
+def kept(tolerance, choices):
+    """A row of `bench_tolerances` from names of paths, predicted and measured errors."""
+    met = [x for x in choices if x[1] <= tolerance / 1.5]
+    ratios = np.array([predicted / measured for _, predicted, measured in met if measured > tolerance / 30])
+    low, middle, high = np.quantile(ratios, [0.025, 0.5, 0.975])
+    names = [name for name, *_ in met]
+    return {
+        "tolerance %": 100 * tolerance,
+        "pairs": len(choices),
+        "met": len(met),
+        "kept": sum(measured <= tolerance for *_, measured in met),
+        "worst / tolerance": max(measured for *_, measured in met) / tolerance,
+        "predicted / measured": f"{middle:.2f} ({low:.2f} to {high:.2f})",
+        "within 0.5 to 2": float(np.mean((ratios >= 0.5) & (ratios <= 2))),
+        "paths": ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)),
+    }  # fmt: skip
+
+
+def worst_colour(got, truth):
+    square = lambda x: np.mean(np.square(np.asarray(x, float).reshape(len(truth), -1)), axis=0)
+    return float(np.max(np.sqrt(square(got - truth) / square(truth))))
 
 
 def bench_saving(tolerances=(0.1, 0.05), count=16384, judged=512):

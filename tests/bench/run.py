@@ -259,6 +259,7 @@ BENCHES = {
     "kernel_pictures": conditioning.bench_kernel_pictures,
     "lobes": lobes.compare,
     "prediction": planning.bench_prediction,
+    "tolerances": planning.bench_tolerances,
     "saving": planning.bench_saving,
     "stability": stability.bench_stability,
 }
@@ -270,7 +271,7 @@ FIGURES = {
 PAGES = {  # markers, and the benchmarks whose tables stand between them
     "conditioning": ("directions", "objectives", "kernels", "kernel_pictures"),
     "lobes": ("lobes",),
-    "planning": ("prediction", "saving"),
+    "planning": ("prediction", "tolerances", "saving"),
     "stability": ("stability",),
 }
 PAGES["bench"] = tuple(name for name in BENCHES if not any(name in names for names in PAGES.values()))
