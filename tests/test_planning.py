@@ -209,6 +209,19 @@ def test_points_are_chosen_where_they_are_cheapest(rng):
     assert judge(Points, mirror, known_light("lamp", lamp, scene().points, 16), 16).error > 1
 
 
+def test_points_are_judged_from_the_surfaces_of_the_scene(rng):
+    """A ball beside an upright lamp, whose near side faces it: surfaces that face all ways there predict 2.4 times."""
+    lamp = models.PolygonLight(LAMP @ np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
+    where = pixels(rng, 1500)
+    where = where[1] * np.float32(0.5), *where[1:]
+    satin = known_material(models.Ggx(0.5), 16, 4)
+    got = shading.shade(shading.Quadrature(models.Ggx(0.5), 4), lamp, surface(*where))
+    want = shading.shade(shading.Quadrature(models.Ggx(0.5), 24), lamp, surface(*where))
+    error = np.sqrt(np.mean((got - want) ** 2) / np.mean(want**2))
+    known = known_light("it", lamp, where[0][:64], 16, where[1][:64])
+    assert 0.6 < judge(Points, satin, known, 4).error / error < 1.6, error
+
+
 def test_light_is_filtered_where_a_table_costs_more(rng):
     """For a narrower lobe, two lights together; the cost is that of the maps."""
     lights, brdf = {name: scene().lights[name] for name in ("room", "sky")}, models.Ggx(0.25, 0.3)
@@ -286,6 +299,8 @@ def test_errors_name_the_argument(as_user, rng):
         planning.Scene(MATERIALS, {"lamp": scene().lights["lamp"]})
     with pytest.raises(ValueError, match="`points` must hold at least one"):
         planning.Scene(MATERIALS, scene().lights, np.zeros((0, 3)))
+    with pytest.raises(ValueError, match="`normals` must be those of `points`; got 3 and 2 `points`"):
+        planning.Scene(MATERIALS, scene().lights, np.zeros((2, 3)), np.ones((3, 3)))
     with pytest.raises(ValueError, match=r"`materials`\['gold'\] must be a models.AbstractBrdf; got str"):
         planning.Scene({"gold": "gold"}, scene().lights)
     with pytest.raises(

@@ -125,6 +125,7 @@ class Local:
     norms: np.ndarray
     light_degree: int
     points: np.ndarray  # [P, 3]
+    normals: np.ndarray | None  # [P, 3], of surfaces that do not face all ways
 
     @property
     def kind(self) -> type:
@@ -160,7 +161,7 @@ def _slices(brdf: AbstractBrdf, views: Float[Array, "v 3"], degree: int) -> Floa
     return jax.lax.map(lambda view: project_slice(brdf, view, width, degree, 32 + degree), views)
 
 
-def known_light(name: str, light: Light, points: Any, degree: int) -> Seen:
+def known_light(name: str, light: Light, points: Any, degree: int, normals: Any = None) -> Seen:
     """A light to a degree, local ones as `points` [P, 3] see them."""
     if isinstance(light, PolygonLight | PortalLight):
         incident = light.incident()  # as a product, without the matrix that shading needs
@@ -168,7 +169,7 @@ def known_light(name: str, light: Light, points: Any, degree: int) -> Seen:
         outline = PolygonLight(light.points, two_sided=light.two_sided)
         seen = project_light(outline, points, degree + light_degree)
         received = multiply(seen[None], incident.reshape(-1, 1, incident.shape[-1]), degree)
-        found = Local(light, _norms(np.asarray(received, float)), light_degree, np.asarray(points))
+        found = Local(light, _norms(np.asarray(received, float)), light_degree, np.asarray(points), normals)
     else:
         if isinstance(light, Environment):
             light = light.light(min(degree, light.texels.shape[0] - 1))

@@ -108,7 +108,8 @@ def plan(
     pair, and 5 to 30 times less for each pixel than by a table of degree 16 or 30. `error` then has 3/5 of it from
     channels.
     Lamps and windows may take points on them (`shading.Quadrature`) in place of slices: `degree` of such an entry is
-    the order, its error what 1024 normals at every point show, against order 24, and `bound` the largest of them.
+    the order, its error what 1024 normals at every point show against order 24, or 16,384 views of the scene's own
+    normals, and `bound` the largest of them.
     Where nothing meets the tolerance, it is a ValueError; with `throw=False` the entry has the best that `max_degree`
     can do and `met` False, the `status` is `tolerance_not_met`, and a UserWarning says so. `progress`: None, True for a
     bar of tqdm, or a function of (done, total) lights and materials.
@@ -155,7 +156,7 @@ def _plan(
     judged = functools.partial(judge, pooled=pooled)
     lights = {}
     for name, light in scene.lights.items():
-        lights[name] = known_light(name, light, scene.points, reference)
+        lights[name] = known_light(name, light, scene.points, reference, scene.normals)
         step()
     entries, paths = [], {}
     for name, brdf in scene.materials.items():

@@ -290,16 +290,21 @@ PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Filtered, Polygon, Po
 
 @functools.lru_cache(maxsize=1)  # the orders of one pair follow each other
 def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
-    """Points of surfaces that face all ways, seen as in the picture of a sphere, and their radiance [N, C]."""
-    axes = np.asarray(fibonacci_directions(_FACING // 2), float)
-    normals = np.concatenate([axes, -axes])
-    u, v = np.modf(np.outer(np.arange(len(normals)) + 0.5, [0.7548776662466927, 0.5698402909980532]))[0].T
+    """Points of surfaces, those of the scene or facing all ways, seen as in a sphere's picture; radiance [N, C]."""
+    if light.normals is None:
+        axes = np.asarray(fibonacci_directions(_FACING // 2), float)
+        normals = np.concatenate([axes, -axes])[None]  # [P or 1, N, 3]
+    else:
+        given = np.asarray(light.normals, float)[:, None]
+        count = max(16, 16 * _FACING // len(given))
+        normals = np.repeat(given / np.linalg.norm(given, axis=-1, keepdims=True), count, axis=1)
+    u, v = np.modf(np.outer(np.arange(normals.shape[1]) + 0.5, [0.7548776662466927, 0.5698402909980532]))[0].T[..., None]
     sine, turn = np.sqrt(u), 2 * np.pi * v  # of the angle between normal and view: cos^2 is even
-    across = np.cross(normals, np.roll(normals, 1, axis=1))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    tangents = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(normals, across)
-    views = np.sqrt(1 - u)[:, None] * normals + sine[:, None] * tangents
-    facing, seen, along = (jnp.asarray(a, float)[None] for a in (normals, views, across))
+    across = np.cross(normals, np.where(np.abs(normals[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    tangents = np.cos(turn) * across + np.sin(turn) * np.cross(normals, across)
+    views = np.sqrt(1 - u) * normals + sine * tangents
+    facing, seen, along = (jnp.asarray(a, float) for a in (normals, views, across))
     surface = Surface(facing, seen, jnp.asarray(light.points, float)[:, None], along)
     return surface, _by_points(material, light, _EXACT, surface)
 

@@ -15,14 +15,22 @@ class Scene(Module):
 
     Arguments: `materials` and `lights` by name; a light is a `models.DistantLight`, an `Environment`, a
     `PolygonLight` or a `PortalLight`; `points` [N, 3], representative positions of surfaces, which judge the local
-    lights. A dozen will do: each costs a projection.
+    lights. A dozen will do: each costs a projection. `normals` [N, 3] of the surfaces there, from which points on lamps
+    are judged, are worth passing, with some dozens of points; without them surfaces face all ways everywhere.
     """
 
     materials: dict[str, AbstractBrdf]
     lights: dict[str, Light]
     points: Float[Array, "n 3"] | None
+    normals: Float[Array, "n 3"] | None
 
-    def __init__(self, materials: dict[str, AbstractBrdf], lights: dict[str, Light], points: ArrayLike | None = None):
+    def __init__(
+        self,
+        materials: dict[str, AbstractBrdf],
+        lights: dict[str, Light],
+        points: ArrayLike | None = None,
+        normals: ArrayLike | None = None,
+    ):
         if not materials or not lights:
             raise ValueError(
                 f"a scene needs at least one of `materials` and of `lights`; got {len(materials)} and {len(lights)}."
@@ -43,3 +51,7 @@ class Scene(Module):
         self.points = None if points is None else _checks.vectors("points", points).reshape(-1, 3)
         if self.points is not None and len(self.points) == 0:
             raise ValueError("`points` must hold at least one position.")
+        self.normals = None if normals is None else _checks.vectors("normals", normals).reshape(-1, 3)
+        if self.normals is not None and (self.points is None or len(self.normals) != len(self.points)):
+            count = "no `points`" if self.points is None else f"{len(self.points)} `points`"
+            raise ValueError(f"`normals` must be those of `points`; got {len(self.normals)} and {count}.")

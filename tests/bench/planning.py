@@ -155,9 +155,9 @@ def bench_tolerances(tolerances=(0.1, 0.03, 0.01), count=1024, max_degree=30):
     all ways; measured against quadrature of the material itself.
     """
     where = pixels(count)
-    points = jnp.asarray(where[0][::80])
+    points, normals = (jnp.asarray(a[::16]) for a in where[:2])
     reference_degree = max(32, 2 * max_degree)
-    seen = {name: known_light(name, light, points, reference_degree) for name, light in eight_lights().items()}
+    seen = {n: known_light(n, light, points, reference_degree, normals) for n, light in eight_lights().items()}
     found = []
     for material, brdf in eight_materials().items():
         known = known_material(brdf, reference_degree, 64)
