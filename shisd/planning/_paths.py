@@ -298,7 +298,8 @@ def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
         given = np.asarray(light.normals, float)[:, None]
         count = max(16, 16 * _FACING // len(given))
         normals = np.repeat(given / np.linalg.norm(given, axis=-1, keepdims=True), count, axis=1)
-    u, v = np.modf(np.outer(np.arange(normals.shape[1]) + 0.5, [0.7548776662466927, 0.5698402909980532]))[0].T[..., None]
+    steps = np.array([0.7548776662466927, 0.5698402909980532])[:, None, None]
+    u, v = np.modf(steps * (np.arange(normals.shape[1]) + 0.5)[:, None])[0]
     sine, turn = np.sqrt(u), 2 * np.pi * v  # of the angle between normal and view: cos^2 is even
     across = np.cross(normals, np.where(np.abs(normals[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
