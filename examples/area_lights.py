@@ -95,6 +95,13 @@ def timed(function: Callable, *arguments) -> tuple[np.ndarray, float]:
     return np.asarray(result, float), time.perf_counter() - start
 
 
+def path_of(part: str, light: str) -> str:
+    """How a light is integrated, for the table."""
+    if part == "walls":
+        return f"degree {DEGREE}"
+    return f"{ORDER} x {ORDER} points" if light == "window" else f"maps, degree {DEGREE}"
+
+
 def run(output: Path, size: int, nodes: int) -> list[dict]:
     rays = _scene.camera_rays(size, EYE, TARGET, np.radians(72))[size // 6 : -size // 6 or None]
     shape, flat = rays.shape[:2], rays.reshape(-1, 3)
@@ -108,13 +115,11 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
     coefficients = np.asarray(outside.coefficients(12))
     expansion = lambda w: harmonics.evaluate(coefficients, w[:, None])
 
-    slices = shading.tabulate_brdf(plaster, DEGREE, domain="upper")
-    beyond, points_on = shading.transform_brdf(wood, DEGREE), shading.Quadrature(wood, ORDER)
     ready = {
-        "floor": {"lamp": (beyond, f"maps, degree {DEGREE}"), "window": (points_on, f"{ORDER} x {ORDER} points")},
-        "walls": dict.fromkeys(("lamp", "window"), (slices, f"degree {DEGREE}")),
+        "floor": shading.Material(local=shading.Quadrature(wood, ORDER), lamps=shading.transform_brdf(wood, DEGREE)),
+        "walls": shading.tabulate_brdf(plaster, DEGREE, domain="upper"),
     }
-    shade = lambda material, light, p, n, v: shading.shade(material, light, shading.Surface(n, v, p))
+    shade = lambda part, light, p, n, v: shading.shade(ready[part], light, shading.Surface(n, v, p))
 
     images, truths, rows = {}, {}, []
     names = [*lights(), "window"]
@@ -129,12 +134,11 @@ def run(output: Path, size: int, nodes: int) -> list[dict]:
                 corners, emission = lights()[name]
                 light = models.PolygonLight(corners.astype(np.float32), emission.astype(np.float32))
             judge = functools.partial(reference.shade_polygon_quadrature, brdfs[part], corners)
-            material, path = ready[part]["window" if name == "window" else "lamp"]
-            image[mask], seconds = timed(functools.partial(shade, material, light), *points)
+            image[mask], seconds = timed(functools.partial(shade, part, light), *points)
             start = time.perf_counter()
             truth[mask] = judge(emission, *points, nodes=nodes)
             reference_seconds = time.perf_counter() - start
-            row = {"light": name, "surface": part, "path": path}
+            row = {"light": name, "surface": part, "path": path_of(part, name)}
             row["error"] = relative(image[mask], truth[mask])
             row["us/pixel"], row["reference us/pixel"] = (1e6 * t / mask.sum() for t in (seconds, reference_seconds))
             if name == "window":

@@ -18,19 +18,19 @@ class Material(Module):
     """A material as `shade` takes it.
 
     `distant`: slices that stand for it everywhere, or its matrix, for light from all around; `local`: slices for light
-    that is cut off at the horizon, best fitted above it; `lamps`, which take the place of both under balls and
-    under polygons that shine alike in all directions: slices beyond maps of directions, or a `Quadrature` of the model,
-    which takes polygons with a profile and portals too. `None` where there is no such light.
+    that is cut off at the horizon, best fitted above it, or a `Quadrature` of the model; `lamps`, which take the place
+    of both under balls and under polygons that shine alike in all directions: slices beyond maps of directions, or a
+    `Quadrature`, which takes polygons with a profile and portals too. `None` where there is no such light.
     """
 
     distant: Slices | BrdfMatrix | None
-    local: Slices | None
+    local: Slices | Quadrature | None
     lamps: TransformedSlices | Quadrature | None
 
     def __init__(
         self,
         distant: Slices | BrdfMatrix | None = None,
-        local: Slices | None = None,
+        local: Slices | Quadrature | None = None,
         lamps: TransformedSlices | Quadrature | None = None,
     ):
         if distant is None and local is None and lamps is None:
@@ -39,8 +39,8 @@ class Material(Module):
             raise ValueError(f"`distant` must be shading.Slices or BrdfMatrix; got {type(distant).__name__}.")
         if distant is not None and distant.domain != "sphere":
             raise ValueError("`distant` was fitted above the horizon only; make it with domain='sphere'.")
-        if not isinstance(local, Slices | None):
-            raise ValueError(f"`local` must be shading.Slices; got {type(local).__name__}.")
+        if not isinstance(local, Slices | Quadrature | None):
+            raise ValueError(f"`local` must be shading.Slices or Quadrature; got {type(local).__name__}.")
         if not isinstance(lamps, TransformedSlices | Quadrature | None):
             raise ValueError(f"`lamps` must be shading.TransformedSlices or Quadrature; got {type(lamps).__name__}.")
         if local is not None and lamps is not None:
@@ -56,7 +56,7 @@ class Material(Module):
 class LocalForms(Module):
     """What stands for a material above the horizon."""
 
-    plain: Slices | None
+    local: Slices | Quadrature | None
     lamps: TransformedSlices | Quadrature | None
 
     @property
@@ -70,7 +70,12 @@ class LocalForms(Module):
     @property
     def uniform(self) -> LampForm:
         """Those for light that is alike in all directions."""
-        return self.plain if self.lamps is None else self.lamps  # type: ignore[return-value]  # one is there
+        return self.local if self.lamps is None else self.lamps  # type: ignore[return-value]  # one is there
+
+    @property
+    def directional(self) -> Slices | Quadrature | None:
+        """Those for light that depends on direction."""
+        return self.lamps if isinstance(self.lamps, Quadrature) else self.local
 
 
 def prepare(

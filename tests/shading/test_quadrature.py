@@ -101,6 +101,20 @@ def test_materials_take_it_under_all_local_lights(rng):
         assert np.max(got) > 1e-3
 
 
+def test_windows_take_it_beside_maps_for_lamps():
+    """One material: maps under a lamp, points under a window."""
+    geometry = tuple(a.astype(np.float32) for a in scene())
+    points, model = OUTLINES["four corners"].astype(np.float32), shading.Quadrature(ggx(np.float32), 2)
+    maps = shading.TransformedSlices(*(np.zeros(x, np.float32) for x in ((8, 5), (8, 9), (8, 9))))
+    both = shading.Material(None, model, maps)
+    lamp, window = models.PolygonLight(points), models.PortalLight(points, np.ones(4, np.float32))
+    got = shade(both, [lamp, window], geometry, np.float32)
+    np.testing.assert_array_equal(got, shade(model, window, geometry, np.float32))  # the maps hold nothing
+    np.testing.assert_array_equal(
+        shade(shading.Material(None, model), lamp, geometry, np.float32), shade(model, lamp, geometry, np.float32)
+    )
+
+
 BALLS = [([0.4, 0.3, 1.5], 0.3, 1.5e-5), ([0, 0, 1], 0.6, 1e-4), ([1, 0, 0.2], 0.5, 5e-4)]
 
 

@@ -271,7 +271,7 @@ def test_materials_are_made_of_forms_that_fit(as_user):
         ("a material needs `distant`, `local` or `lamps` slices; got none.", (None, None)),
         ("`distant` must be shading.Slices or BrdfMatrix; got int.", (1, None)),
         ("`distant` was fitted above the horizon only; make it with domain='sphere'.", (upper, sphere)),
-        ("`local` must be shading.Slices; got int.", (sphere, 1)),
+        ("`local` must be shading.Slices or Quadrature; got int.", (sphere, 1)),
     ):
         with pytest.raises(ValueError, match=rf"^{re.escape(message)}$"):
             shading.Material(*arguments)

@@ -41,12 +41,12 @@ def _shade(
     points: dict[str, Float[Array, "p 3"]], forms: LocalForms, lights: list[Light], colour: tuple[int, ...]
 ) -> Float[Array, " p *colour"]:
     kinds = stacked(lights)
-    model = forms.lamps if isinstance(forms.lamps, Quadrature) else None
-    stacks = [(stack, _products(stack, forms.plain) if model is None else _expansions(stack)) for stack in kinds]
+    form = forms.directional
+    model = form if isinstance(form, Quadrature) else None
+    slices = form if isinstance(form, Slices) else None
+    stacks = [(stack, _products(stack, slices) if model is None else _expansions(stack)) for stack in kinds]
     uniform = integrals_of(forms.uniform)
-    directional = (
-        None if forms.plain is None else functools.partial(_directional, forms.plain, lookup_table(forms.plain))
-    )
+    directional = None if slices is None else functools.partial(_directional, slices, lookup_table(slices))
 
     def of_tile(
         frame: Float[Array, "p 3 3"], local: Float[Array, "p 3"], positions: Float[Array, "p 3"]
