@@ -40,10 +40,8 @@ class TransformedExpansion(Module):
     """An expansion beyond a map, and a base: det(A) / |A w|^3 sum_lm c_lm y_lm(A w / |A w|) + sum_lm b_lm y_lm(w).
 
     Arguments: `transform` [3, 3], A, of positive determinant, its scale without effect; `coefficients` [*colour,
-    (degree + 1)^2], c; `base` [*colour, (base degree + 1)^2], b, none unless given. Its integral over a polygon is that
-    of the expansion over the mapped polygon and that of the base:
-    `domains.integrate(f.coefficients, domains.SphericalPolygon(f.directions(polygon.vertices)))` and
-    `domains.integrate(f.base, polygon)`.
+    (degree + 1)^2], c; `base` [*colour, (base degree + 1)^2], b, none unless given. Its integral over a polygon,
+    `domains.integrate(f, polygon)`, is that of the expansion over the mapped polygon and that of the base.
     Derivatives: everywhere, in all.
     """
 

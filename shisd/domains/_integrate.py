@@ -19,7 +19,7 @@ import numpy as np
 from shisd import _checks
 from shisd._numerics import dot, normalize, same_dtype
 from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
-from shisd.decomposition import fibonacci_directions, optimized_directions
+from shisd.decomposition import TransformedExpansion, fibonacci_directions, optimized_directions
 from shisd.decomposition.internal import TABLE_DEGREE
 from shisd.domains._polygon import SphericalPolygon, for_each, loop_solid_angle
 from shisd.domains._region import SphericalCap, cap_coefficients, cap_integrals
@@ -82,20 +82,33 @@ def polygon_coefficients(region: Region, degree: int) -> Float[Array, "*batch n"
     return _coefficients(region, degree)
 
 
-def integrate(coefficients: ArrayLike, region: Region) -> Float[Array, "*batch"]:
+def integrate(coefficients: ArrayLike | TransformedExpansion, region: Region) -> Float[Array, "*batch"]:
     """The integral of SH expansions over a region (CSH18 Eq. 1).
 
     Arguments: `coefficients` [..., (L+1)^2]; a `SphericalPolygon` or `SphericalCap`. Returns [...], or of many polygons
     [..., *their axes]. To each polygon its own coefficients: `jax.vmap(integrate)(coefficients, polygons)`.
+    Of a `decomposition.TransformedExpansion` over a polygon: beyond the map that is a polygon again.
     Derivatives: in all floating arguments.
     Accuracy: relative, in the median of random expansions of degree 20, 1e-13 in float64 and 2e-5 in float32.
     """
+    if isinstance(coefficients, TransformedExpansion):
+        return _integral_beyond(coefficients, region)
     c, degree = _checks.coefficients("coefficients", coefficients)
     _check_region(region)
     if isinstance(region, SphericalPolygon) and c.ndim == 1:
         return _integral(c, region, degree)
     c, basis = same_dtype(c, _coefficients(region, degree))
     return jnp.tensordot(c, basis, axes=(-1, -1), precision="highest")
+
+
+def _integral_beyond(f: TransformedExpansion, region: Region) -> Float[Array, "*batch"]:
+    if not isinstance(region, SphericalPolygon):
+        raise ValueError(
+            f"a TransformedExpansion is integrated over a domains.SphericalPolygon; got {type(region).__name__}."
+        )
+    mapped = SphericalPolygon(f.directions(region.vertices), largest=region.largest)
+    whole = integrate(f.coefficients, mapped)
+    return whole if f.base is None else jnp.add(*same_dtype(whole, integrate(f.base, region)))
 
 
 def _axes(axes: ArrayLike) -> Float[Array, "k 3"]:

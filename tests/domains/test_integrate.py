@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from shisd import domains
+from shisd import decomposition, domains
 from tests import truth
 from tests.hard_cases import HALF_TURNS, POLYGONS, TINY, padded, random_polygon, ring, unit
+from tests.marks import FLOAT64_FIRST
 
 
 @pytest.mark.parametrize("name", POLYGONS | HALF_TURNS | TINY)
@@ -35,6 +36,23 @@ def test_coefficients_and_integrals_of_hard_cases(name, rng):
         rms = np.sqrt(np.sum(expected**2))  # of an expansion whose coefficients are about 1
         error = np.max(np.abs(whole - c.astype(float) @ expected)) / rms
         assert error < 2 * limit, (dtype.__name__, error)
+
+
+@FLOAT64_FIRST
+def test_expansions_beyond_maps(dtype, rng):
+    """Of two colours, with a base and without, over many polygons, against area quadrature of its values."""
+    polygons = np.stack([random_polygon(rng, 5, 0.6) for _ in range(3)])
+    a, c, b = np.eye(3) + 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(2, 25)), rng.normal(size=(2, 9))
+    wanted = lambda f: np.stack([np.asarray(f.evaluate(w)) @ area for w, area in rules], axis=-1)
+    rules = [[x.astype(dtype) for x in truth.triangle_rule(p.astype(dtype), 24)] for p in polygons]
+    for base in (None, b.astype(dtype)):
+        f = decomposition.TransformedExpansion(a.astype(dtype), c.astype(dtype), base)
+        got = domains.integrate(f, domains.SphericalPolygon(polygons.astype(dtype)))
+        assert got.dtype == dtype and got.shape == (2, 3)
+        want = wanted(f)
+        assert np.max(np.abs(got - want)) < (1.5e-6 if dtype == np.float32 else 5e-15) * np.max(np.abs(want))
+    with pytest.raises(ValueError, match="is integrated over a domains.SphericalPolygon; got SphericalCap"):
+        domains.integrate(f, domains.SphericalCap(np.array([0, 0, 1], dtype), dtype.type(0.5)))
 
 
 @pytest.mark.slow
