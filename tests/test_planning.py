@@ -237,6 +237,9 @@ def test_light_is_filtered_where_a_table_costs_more(rng):
     mean = lambda x: np.mean(np.square(x), axis=0)
     error = np.max(np.sqrt(mean(made.shade("it", surface(*where)) - truth) / mean(truth)))
     assert 0.2 < error / first.error < 1 and error < 0.03, (error, first.error)  # both lights beside one
+    red = models.DistantLight(lights["room"].coefficients(16) * np.float32([[1], [0], [0]]))
+    alone = planning.plan(planning.Scene({"it": brdf}, {"red": red}), 0.03, max_degree=16)
+    assert alone.entries[0].path == "filtered" and np.all(np.asarray(alone.shade("it", surface(*where)))[:, 1:] == 0)
 
 
 @pytest.mark.slow

@@ -137,6 +137,7 @@ class Local:
 
 
 Seen = Distant | Local
+_DARK = 1e-6  # of the brightest colour's radiance: a colour below it is rounding
 
 
 def known_material(brdf: AbstractBrdf, degree: int, elevations: int) -> Material:
@@ -198,3 +199,9 @@ def predict(slices: np.ndarray, lights: np.ndarray, shares: np.ndarray) -> tuple
     worst = slices @ np.swapaxes(lights, 1, 2)  # [C, V, P]
     square = np.sum(energy / (2 * np.arange(slices.shape[-1]) + 1), axis=-1)
     return np.sqrt(square), np.sqrt(np.mean(np.einsum("v,cvp->cp", shares, worst**2), axis=1))
+
+
+def worst(error: np.ndarray, radiance: np.ndarray) -> float:
+    """The largest of errors relative to the radiance [C]; what is dark beside other colours has none."""
+    dark = radiance <= _DARK * np.max(radiance)
+    return float(np.max(np.where(dark, 0, error / np.where(dark, 1, radiance))))

@@ -15,7 +15,7 @@ from shisd._typing import Array, Float
 from shisd.decomposition import fibonacci_directions
 from shisd.harmonics import convolve, evaluate
 from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
-from shisd.planning._bands import Distant, Local, Material, predict
+from shisd.planning._bands import Distant, Local, Material, predict, worst
 from shisd.shading import Prefiltered, Quadrature, Slices, Surface, prefilter, shade
 from shisd.shading.internal import as_type, best_channels, finite_mark, finite_or_nan, maps_of, shade_points
 
@@ -188,8 +188,8 @@ class Filtered(Expanded):
     @classmethod
     def tolerance(cls, material, lights, degree) -> float:
         """Of the channels."""
-        errors = [np.max(error / radiance) for error, _, radiance in (cls.errors(material, x, degree) for x in lights)]
-        return max(3 / 5 * float(max(errors)), 1e-3)
+        errors = [worst(error, radiance) for error, _, radiance in (cls.errors(material, x, degree) for x in lights)]
+        return max(3 / 5 * max(errors), 1e-3)
 
     @classmethod
     def make(cls, material, slices, lights, degree):

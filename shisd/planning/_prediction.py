@@ -4,10 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shisd.planning._bands import Material, Seen
+from shisd.planning._bands import Material, Seen, worst
 from shisd.planning._paths import Path, Table
-
-_DARK = 1e-6  # of the brightest colour's radiance: a colour below it is rounding
 
 
 class Choice(NamedTuple):
@@ -32,6 +30,4 @@ def judge(path: type[Path], material: Material, light: Seen, degree: int, *, poo
     error, bound, radiance = path.errors(material, light, degree)
     if pooled:
         error, bound, radiance = (np.sqrt(np.sum(np.square(x), keepdims=True)) for x in (error, bound, radiance))
-    dark = radiance <= _DARK * np.max(radiance)
-    relative = lambda x: float(np.max(np.where(dark, 0, x / np.where(dark, 1, radiance))))
-    return Choice(path, degree, relative(error), relative(bound))
+    return Choice(path, degree, worst(error, radiance), worst(bound, radiance))
