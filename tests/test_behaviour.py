@@ -579,7 +579,7 @@ CASES = [
     Case(
         "shading.shade Quadrature",
         shading.shade,
-        lambda: (shading.Quadrature(models.Ggx(np.float32(0.4), np.float32([0.3, 0.6, 1])), 2), portal(), placed()),
+        lambda: (shading.Quadrature(models.Ggx(np.float32(0.4), np.float32([0.3, 0.6, 1])), 16), portal(), placed()),
         (2,),
         heavy=True,
     ),
