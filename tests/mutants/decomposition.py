@@ -152,9 +152,9 @@ MUTANTS = [
     ),
     Mutant(
         "predictions of the mean of the colours",
-        "shisd/planning/_prediction.py",
-        old="float(np.max(np.where(dark, 0, x / np.where(dark, 1, radiance))))",
-        new="float(np.sqrt(np.sum(x**2) / np.sum(radiance**2)))",
+        "shisd/planning/_bands.py",
+        old="float(np.max(np.where(dark, 0, error / np.where(dark, 1, radiance))))",
+        new="float(np.sqrt(np.sum(error**2) / np.sum(radiance**2)))",
         test="tests/test_planning.py::test_errors_are_those_of_the_worst_colour",
     ),
 ]
