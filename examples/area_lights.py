@@ -23,7 +23,6 @@ from shisd import harmonics, io, models, reference, shading
 
 BOX = np.array([[-3.0, 0.0, 0.0], [3.0, 6.0, 3.0]])
 EYE, TARGET = np.array([0.4, 0.25, 1.55]), np.array([-0.15, 4.0, 0.75])
-PARTS = "floor", "walls"
 DEGREE, ORDER = 8, 16  # of slices, and of points on the window as the floor sees it
 LIMITS = 1e-6, 1e-1  # relative errors at the ends of the false-colour scale
 
@@ -207,7 +206,7 @@ def main(arguments: list[str] | None = None) -> None:
     _scene.save(options.output / "area_lights.md", text + "\n")
     print(text)
     check(rows)
-    worst = {part: max(r["error"] for r in rows if r["surface"] == part) for part in PARTS}
+    worst = {part: max(r["error"] for r in rows if r["surface"] == part) for part in ("floor", "walls")}
     reached = f"Radiance within {worst['floor']:.1e} of quadrature on the floor and {worst['walls']:.1e} on the walls"
     _scene.verdict(reached, start, options.output)
 

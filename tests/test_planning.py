@@ -216,7 +216,7 @@ def test_points_are_judged_from_the_surfaces_of_the_scene(rng):
     where = where[1] * np.float32(0.5), *where[1:]
     satin = known_material(models.Ggx(0.5), 16, 4)
     got = shading.shade(shading.Quadrature(models.Ggx(0.5), 4), lamp, surface(*where))
-    want = shading.shade(shading.Quadrature(models.Ggx(0.5), 24), lamp, surface(*where))
+    want = reference.shade_polygon_quadrature(models.Ggx(0.5), lamp.points, lamp.emission, *where, nodes=24)
     error = np.sqrt(np.mean((got - want) ** 2) / np.mean(want**2))
     known = known_light("it", lamp, where[0][:64], 16, where[1][:64])
     assert 0.6 < judge(Points, satin, known, 4).error / error < 1.6, error
@@ -305,6 +305,9 @@ def test_errors_name_the_argument(as_user, rng):
         planning.Scene(MATERIALS, scene().lights, np.zeros((0, 3)))
     with pytest.raises(ValueError, match="`normals` must be those of `points`; got 3 and 2 `points`"):
         planning.Scene(MATERIALS, scene().lights, np.zeros((2, 3)), np.ones((3, 3)))
+    for bad in (0.0, np.nan):
+        with pytest.raises(ValueError, match="`normals` has a vector that is zero or not finite"):
+            planning.Scene(MATERIALS, scene().lights, np.zeros((2, 3)), np.float32([[0, 0, 1], [bad, bad, bad]]))
     with pytest.raises(ValueError, match=r"`materials`\['gold'\] must be a models.AbstractBrdf; got str"):
         planning.Scene({"gold": "gold"}, scene().lights)
     with pytest.raises(

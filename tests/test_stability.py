@@ -52,7 +52,7 @@ LIMITS = {
     # by luck of the tables' rounding: for alpha 0.42 to 0.6 the next two are off by 4e-5 to 6e-3 in float32
     "view at the normal, polygon": {"value": (3e-06, 7e-15), "gradient": (2e-03, 2e-08)},
     "view at a normal off the axes": {"value": (1e-05, 3e-15), "gradient": (4e-03, 2e-07)},
-    # on one machine 3e-8 in float32, on another 7e-7, by the length of its vectors
+    # in float32 2.6e-7 with SSE4.2, 6.2e-7 with AVX, 7.3e-7 with AVX2, on another machine 3e-8
     "roughness 0.02 to radiance": {"value": (2e-06, 2e-07), "gradient": (6e-05, 2e-05)},
     "roughness 1 to radiance": {"value": (5e-07, 2e-14), "gradient": (4e-05, 3e-07)},
     "view 89.9 degrees from the normal, environment": {"value": (2e-04, 2e-04), "gradient": (4e-03, 4e-03)},

@@ -125,7 +125,7 @@ class Local:
     norms: np.ndarray
     light_degree: int
     points: np.ndarray  # [P, 3]
-    normals: np.ndarray | None  # [P, 3], of surfaces that do not face all ways
+    normals: np.ndarray | None  # [P, 3], unit vectors, of surfaces that do not face all ways
 
     @property
     def kind(self) -> type:

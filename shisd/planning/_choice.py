@@ -167,10 +167,10 @@ def _plan(
         slices = as_type(tabulate_brdf(brdf, max(needed), elevations=elevations), float) if needed else None
         for of, choice in choices.items():
             alone = hosts[of] == of
-            cost, joined = (choice.cost(material, lights[of]), "") if alone else (0.0, hosts[of])
+            cost, joined = (choice.cost, "") if alone else (0.0, hosts[of])
             met = choice.error <= tolerance / margin
             entries.append(
-                Entry(name, of, choice.name(material), choice.degree, choice.error, choice.bound, cost, joined, met)
+                Entry(name, of, choice.name, choice.degree, choice.error, choice.bound, cost, joined, met)
             )
         paths[name] = tuple(
             choice.path.make(material, slices, [lights[of] for of in choices if hosts[of] == host], choice.degree)
@@ -188,7 +188,7 @@ def _choose(judged: Judge, material: Material, light: Seen, target: float, max_d
         if path.takes is light.kind:
             found.append(_first(judged, path, material, light, target, max_degree))
     good = [choice for choice in found if choice.error <= target]
-    return min(good, key=lambda c: c.cost(material, light)) if good else min(found, key=lambda c: c.error)
+    return min(good, key=lambda c: c.cost) if good else min(found, key=lambda c: c.error)
 
 
 def _first(

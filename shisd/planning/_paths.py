@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd._module import Module
-from shisd._numerics import normalize
+from shisd._numerics import normalize, tangents
 from shisd._sharding import by_device
 from shisd._typing import Array, Float
 from shisd.decomposition import fibonacci_directions
@@ -295,16 +295,13 @@ def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
         axes = np.asarray(fibonacci_directions(_FACING // 2), float)
         normals = np.concatenate([axes, -axes])[None]  # [P or 1, N, 3]
     else:
-        given = np.asarray(light.normals, float)[:, None]
-        count = max(16, 16 * _FACING // len(given))
-        normals = np.repeat(given / np.linalg.norm(given, axis=-1, keepdims=True), count, axis=1)
+        count = max(16, 16 * _FACING // len(light.normals))
+        normals = np.repeat(light.normals[:, None], count, axis=1)
     steps = np.array([0.7548776662466927, 0.5698402909980532])[:, None, None]
     u, v = np.modf(steps * (np.arange(normals.shape[1]) + 0.5)[:, None])[0]
     sine, turn = np.sqrt(u), 2 * np.pi * v  # of the angle between normal and view: cos^2 is even
-    across = np.cross(normals, np.where(np.abs(normals[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
-    across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    tangents = np.cos(turn) * across + np.sin(turn) * np.cross(normals, across)
-    views = np.sqrt(1 - u) * normals + sine * tangents
+    across, upon = (np.moveaxis(np.asarray(x), 0, -1) for x in tangents(jnp.moveaxis(normals, -1, 0)))
+    views = np.sqrt(1 - u) * normals + sine * (np.cos(turn) * across + np.sin(turn) * upon)
     facing, seen, along = (jnp.asarray(a, float) for a in (normals, views, across))
     surface = Surface(facing, seen, jnp.asarray(light.points, float)[:, None], along)
     return surface, _by_points(material, light, _EXACT, surface)

@@ -1,6 +1,7 @@
 """A path at a degree, judged: its error relative to the radiance, for the worst colour or of all together."""
 
-from typing import NamedTuple
+import functools
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,21 +9,26 @@ from shisd.planning._bands import Material, Seen, worst
 from shisd.planning._paths import Path, Table
 
 
-class Choice(NamedTuple):
-    """A path at a degree, with its relative RMS error and the bound on it, as in `Entry`."""
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A path at a degree for a material and a light, with its relative RMS error and the bound on it, as in `Entry`."""
 
     path: type[Path]
+    material: Material
+    light: Seen
     degree: int
     error: float
     bound: float
 
-    def cost(self, material: Material, light: Seen) -> float:
-        return self.path.cost(material, light, self.degree)
+    @functools.cached_property
+    def cost(self) -> float:
+        return self.path.cost(self.material, self.light, self.degree)
 
-    def name(self, material: Material) -> str:
+    @property
+    def name(self) -> str:
         if self.path is not Table:
             return self.path.name
-        return f"{'isotropic' if material.isotropic else 'anisotropic'} {self.path.name}"
+        return f"{'isotropic' if self.material.isotropic else 'anisotropic'} {self.path.name}"
 
 
 def judge(path: type[Path], material: Material, light: Seen, degree: int, *, pooled: bool = False) -> Choice:
@@ -30,4 +36,4 @@ def judge(path: type[Path], material: Material, light: Seen, degree: int, *, poo
     error, bound, radiance = path.errors(material, light, degree)
     if pooled:
         error, bound, radiance = (np.sqrt(np.sum(np.square(x), keepdims=True)) for x in (error, bound, radiance))
-    return Choice(path, degree, worst(error, radiance), worst(bound, radiance))
+    return Choice(path, material, light, degree, worst(error, radiance), worst(bound, radiance))

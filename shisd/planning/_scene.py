@@ -1,9 +1,11 @@
 """The scene that is planned for: materials, lights, and points that see the local ones."""
 
+import numpy as np
 from typing_extensions import TypeAliasType
 
 from shisd import _checks
 from shisd._module import Module
+from shisd._numerics import normalize
 from shisd._typing import Array, ArrayLike, Float
 from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
 
@@ -51,7 +53,9 @@ class Scene(Module):
         self.points = None if points is None else _checks.vectors("points", points).reshape(-1, 3)
         if self.points is not None and len(self.points) == 0:
             raise ValueError("`points` must hold at least one position.")
-        self.normals = None if normals is None else _checks.vectors("normals", normals).reshape(-1, 3)
+        self.normals = None if normals is None else normalize(_checks.vectors("normals", normals).reshape(-1, 3))
         if self.normals is not None and (self.points is None or len(self.normals) != len(self.points)):
             count = "no `points`" if self.points is None else f"{len(self.points)} `points`"
             raise ValueError(f"`normals` must be those of `points`; got {len(self.normals)} and {count}.")
+        if self.normals is not None and not np.all(np.isfinite(self.normals)):
+            raise ValueError("`normals` has a vector that is zero or not finite.")

@@ -8,6 +8,9 @@ between four of them
 which Gauss-Legendre rules take in u and v. Where a quadrilateral is not convex its patch leaves it, and comes back with
 the other sign: the integral is that over the outline. Unit vertices, and not those of the light, keep |x| alike where
 one end of the light is near and the other far.
+
+When vertices move, an edge x(t) = a + t (b - a) sweeps dx . (a x b) / |x|^3 dt of solid angle. The integral changes by
+that times f(x / |x|), over all edges (Reynolds' transport theorem): values of f only, along lines.
 """
 
 import functools
@@ -82,10 +85,7 @@ def integrate(
 
 
 def _integrate_jvp(function: Callable, order: int, center: bool, primals: tuple, tangents: tuple):
-    """In the inputs that of the rule. In the vertices that of the integral: the function, where the edges go.
-
-    What an edge a + t (b - a) sweeps is f (dx . (a x b)) / |x|^3 dt, outwards of the loop with the other sign.
-    """
+    """In the inputs that of the rule, in the vertices that of the integral."""
     (inputs, v), (d_inputs, dv) = primals, tangents
     leaves, form = jax.tree.flatten(inputs)
     moves = {i: d for i, d in enumerate(jax.tree.leaves(d_inputs)) if not isinstance(d, SymbolicZero)}
@@ -104,7 +104,7 @@ integrate.defjvp(_integrate_jvp, symbolic_zeros=True)
 
 
 def _swept(function: Callable, v: Loop, dv: Loop, order: int) -> Float[Array, "*colour p"]:
-    """- integral of f(x / |x|) dx . (a x b) / |x|^3 dt over all edges x = a + t (b - a)."""
+    """- integral of f(x / |x|) dx . (a x b) / |x|^3 dt over all edges, whose a x b points inwards."""
     a, b, da, db = v, jnp.roll(v, -1, 1), dv, jnp.roll(dv, -1, 1)
     normal = cross(a, b)
     t, weight = np.polynomial.legendre.leggauss(order)

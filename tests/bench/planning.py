@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from shisd import Status, models, planning, reference, shading
+from shisd import Status, harmonics, models, planning, reference, shading
 from shisd.planning._bands import known_light, known_material
 from shisd.planning._choice import _choose
 from shisd.planning._paths import Expanded, Polygon, Table
@@ -65,10 +65,11 @@ def relative(got, truth):
 def truth_of(brdf, light, where):
     if isinstance(light, models.Environment):
         return np.asarray(reference.shade_environment_quadrature(brdf, light, *where[1:]))
-    if isinstance(light, models.PortalLight):  # at more points than any plan takes
-        finest = shading.Quadrature(brdf, 32)
-        return np.asarray(shading.shade(finest, light, shading.Surface(*where[1:], where[0])))
-    return np.asarray(reference.shade_polygon_quadrature(brdf, light.points, light.emission, *where, nodes=24))
+    if isinstance(light, models.PortalLight):
+        emission = lambda w: harmonics.evaluate(light.coefficients, w[:, None])
+    else:
+        emission = light.emission
+    return np.asarray(reference.shade_polygon_quadrature(brdf, light.points, emission, *where, nodes=24))
 
 
 def general(brdf, light, degree, views=64):

@@ -258,12 +258,20 @@ def test_bad_input_is_named(call, message, as_user):
         call(domains.SphericalPolygon(np.eye(3, dtype=np.float32)))
 
 
-@pytest.mark.slow
-def test_values_and_derivatives_as_users_compile_them():
-    """The hard cases with all of XLA's optimisations, which the tests leave out."""
+def run_as_users_compile(selection):
+    """Tests of this file with all of XLA's optimisations, which the tests leave out."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", __file__]
-    command += ["-k", "(test_values_and_derivatives or right_angles) and not users"]
+    command += ["-k", f"{selection} and not users"]
     run = subprocess.run(
         command, cwd=ROOT, env={**os.environ, "SHISD_TESTS_AS_USERS": "1"}, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stdout + run.stderr
+
+
+@pytest.mark.slow
+def test_hard_cases_as_users_compile_them():
+    run_as_users_compile("test_values_and_derivatives")
+
+
+def test_right_angles_as_users_compile_them():
+    run_as_users_compile("right_angles")

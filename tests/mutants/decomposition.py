@@ -157,4 +157,25 @@ MUTANTS = [
         new="float(np.sqrt(np.sum(error**2) / np.sum(radiance**2)))",
         test="tests/test_planning.py::test_errors_are_those_of_the_worst_colour",
     ),
+    Mutant(
+        "columns that are orthogonal but for a shift",
+        "shisd/decomposition/_transformed.py",
+        old="(10 * n * eps, 0.0, 0.0)",
+        new="(10 * n * eps,)",
+        test="tests/decomposition/test_transformed.py",
+    ),
+    Mutant(
+        "points on lamps judged from all sides where normals are known",
+        "shisd/planning/_paths.py",
+        old="if light.normals is None:",
+        new="if True:",
+        test="tests/test_planning.py::test_points_are_judged_from_the_surfaces_of_the_scene",
+    ),
+    Mutant(
+        "light filtered as if channels were for nothing",
+        "shisd/planning/_paths.py",
+        old="return max(3 / 5 * max(errors), 1e-3)",
+        new="return max(6 * max(errors), 1e-3)",
+        test="tests/test_planning.py::test_light_is_filtered_where_a_table_costs_more",
+    ),
 ]

@@ -46,7 +46,12 @@ MUTANTS = [
     Mutant(
         "a sign that roundings choose", _RECURRENCE,
         old="dot(_leading(d), _leading(c)) < 0", new="dot(d, c) < 0",
-        test="tests/domains/test_moments.py::test_values_and_derivatives_as_users_compile_them",
+        test="tests/domains/test_moments.py::test_right_angles_as_users_compile_them",
+    ),
+    Mutant(
+        "an expansion beyond a map over the polygon as it is", "shisd/domains/_integrate.py",
+        old="SphericalPolygon(f.directions(region.vertices), ", new="SphericalPolygon(region.vertices, ",
+        test="tests/domains/test_integrate.py::test_expansions_beyond_maps[float32]",
     ),
     Mutant(
         "a sum of ends where they cancel", _RECURRENCE,

@@ -71,6 +71,11 @@ MUTANTS = [
         test="tests/shading/test_quadrature.py::test_derivatives_in_everything",
     ),
     Mutant(
+        "points for windows are not looked for beside maps", "shisd/shading/_material.py",
+        old="isinstance(self.lamps, Quadrature) else self.local", new="isinstance(self.lamps, Quadrature) else None",
+        test="tests/shading/test_quadrature.py::test_windows_take_it_beside_maps_for_lamps",
+    ),
+    Mutant(
         "patches are flat", "shisd/shading/_quadrature.py",
         old="d - a, (a - b) - (d - c))", new="d - a, 0 * a)",
         test=POINTS + "test_radiance_of_the_model[six corners]",
