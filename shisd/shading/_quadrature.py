@@ -45,7 +45,7 @@ class Quadrature(Module):
     Derivatives: in the light's points, positions and frames that of the integral, as the model at points of the edges;
     it has an error of its own, smaller than that of the rule's derivative (a wall that the horizon cuts, alpha 0.5,
     order 4: 8e-3 for 1.6e-1). In views and the model, that of the rule. All orders, both modes. A gradient in
-    everything takes 3.5 times the value.
+    everything takes 3.1 times the value (order 4, a panel, 16,384 points).
     """
 
     brdf: AbstractBrdf
