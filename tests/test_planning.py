@@ -10,9 +10,11 @@ from jax.test_util import check_grads
 
 from shisd import Status, harmonics, models, planning, reference, shading
 from shisd.planning._bands import Distant, Material, known_light, known_material, predict
-from shisd.planning._paths import Points, Polygon, Table
+from shisd.planning._choice import _choose
+from shisd.planning._paths import Maps, Points, Polygon, Table
 from shisd.planning._prediction import judge
 from tests.hard_cases import unit
+from tests.models.materials import GOLD_PAINT
 
 LAMP = np.array([[-0.5, -0.5, 1.5], [-0.5, 0.5, 1.5], [0.5, 0.5, 1.5], [0.5, -0.5, 1.5]], np.float32)
 MATERIALS = {"clay": models.Lambertian(np.float32([0.7, 0.5, 0.4])), "satin": models.Ggx(0.6, 0.3)}
@@ -59,9 +61,12 @@ def planned():
 
 
 def general(material, light, degree, positions, normals, views, path="table"):
-    """One light at one degree by the path that always works, or by points."""
+    """One light at one degree by the path that always works, filtered, or by points."""
     if path == "points":
         return shading.shade(shading.Quadrature(material, degree), light, shading.Surface(normals, views, positions))
+    if path == "filtered":  # and as well as a table
+        filtered = shading.prefilter(shading.tabulate_brdf(material, degree), light.light(degree), tolerance=1e-4)
+        return filtered.radiance(shading.Surface(normals, views))
     if isinstance(light, models.Environment):
         slices = shading.tabulate_brdf(material, degree)
         return shading.shade(slices, light.light(degree), shading.Surface(normals, views))
@@ -92,7 +97,7 @@ def test_the_cheapest_valid_path_is_found():
     assert planned().status == Status.ok and len(chosen) == 6
     assert all(e.error <= 0.03 / 1.5 and e.error <= e.bound for e in chosen.values())
     assert chosen["clay", "room"].path == chosen["clay", "sky"].path == "irradiance"
-    assert chosen["satin", "room"].path == "isotropic table"
+    assert chosen["satin", "room"].path == "filtered"
     assert chosen["satin", "sky"].joined == "room" and chosen["satin", "sky"].cost == 0
     assert chosen["satin", "lamp"].path == chosen["clay", "lamp"].path == "points"
     clay = known_material(MATERIALS["clay"], MAX_DEGREE, 4)
@@ -100,19 +105,22 @@ def test_the_cheapest_valid_path_is_found():
     constant, cosine = (judge(Polygon, clay, lamp, degree).error for degree in (0, 1))
     assert cosine < 0.02 < constant  # the cosine above the horizon, where the fit is
     text = str(planned())
-    assert all(word in text for word in ("visibility", "irradiance", "isotropic table", "added to room"))
+    assert all(word in text for word in ("visibility", "irradiance", "filtered", "added to room"))
 
 
 def test_lights_with_an_axis_are_not_rotated(rng):
     told = []
-    alone = planning.Scene({"satin": MATERIALS["satin"]}, {"sky": scene().lights["sky"]})
-    made = planning.plan(alone, 0.01, max_degree=4, progress=lambda *counts: told.append(counts))
+    brushed = models.Ggx(np.float32([0.4, 0.7]), 0.5)  # others may be filtered for
+    alone = planning.Scene({"it": brushed}, {"sky": scene().lights["sky"]})
+    made = planning.plan(alone, 0.01, max_degree=4, elevations=16, progress=lambda *counts: told.append(counts))
     assert told == [(1, 2), (2, 2)]
     (entry,) = made.entries
     assert entry.path == "zonal light" and entry.degree == 1
     _, normals, views = pixels(rng, 50)
-    expected = general(MATERIALS["satin"], scene().lights["sky"], 1, None, normals, views)
-    got = made.shade("satin", shading.Surface(normals, views))
+    tangents = np.cross(normals, [0.3, -0.8, 0.5]).astype(np.float32)
+    slices = shading.tabulate_brdf(brushed, 1, elevations=16)
+    expected = shading.shade(slices, scene().lights["sky"].light(1), shading.Surface(normals, views, None, tangents))
+    got = made.shade("it", shading.Surface(normals, views, None, tangents))
     np.testing.assert_allclose(got, expected, atol=1e-4 * np.max(np.abs(expected)))
 
 
@@ -138,7 +146,8 @@ def test_a_plan_is_the_general_path_at_its_degrees(material, rng):
         expected = expected + np.asarray(lit).reshape(40, -1)
     got = planned().shade(material, surface(*where))
     assert got.shape == (40, 3) and got.dtype == np.float32
-    np.testing.assert_allclose(got, expected, atol=3e-5 * np.max(expected))
+    near = 3e-5 * np.max(expected) if material == "clay" else 0.6 * entries[0].error * np.sqrt(np.mean(expected**2))
+    assert np.sqrt(np.mean((got - expected) ** 2)) < near  # channels have their share of the error
     jitted = jax.jit(lambda s: planned().shade(material, s))
     np.testing.assert_allclose(jitted(surface(*where)), got, atol=1e-5 * np.max(expected))
     below = planned().shade(material, surface(where[0], where[1], -where[2]))
@@ -209,6 +218,31 @@ def test_points_are_chosen_where_they_are_cheapest(rng):
     assert judge(Points, mirror, known_light("lamp", lamp, scene().points, 16), 16).error > 1
 
 
+@pytest.mark.slow
+def test_maps_are_chosen_for_sharp_materials():
+    """Also where the lobe is too narrow for any number of points to be the truth."""
+    where = pixels(np.random.default_rng(3), 3000)
+    lamp = models.PolygonLight(LAMP)
+    known = known_light("it", lamp, where[0][:64], 16)
+    brdf = models.Ggx(0.03, 0.5)
+    material = known_material(brdf, 16, 64)
+    truth = reference.shade_polygon_quadrature(brdf, LAMP, lamp.emission, *where, nodes=144)
+    for degree in (4, 8):
+        form = material.beyond_maps(degree)
+        error = np.sqrt(np.mean((shading.shade(form, lamp, surface(*where)) - truth) ** 2) / np.mean(truth**2))
+        assert 0.5 < judge(Maps, material, known, degree).error / error < 2, (degree, error)
+    chosen = _choose(judge, material, known, 0.02, 16)
+    assert chosen.path is Maps and chosen.degree == 4
+    assert not Maps.serves(material, known_light("it", models.PortalLight(LAMP, np.ones(1)), where[0][:4], 4))
+
+
+def test_what_values_of_a_model_cost():
+    """Series and tables make most of it: SGD takes 30 times as long as GGX."""
+    cost = lambda brdf: known_material(brdf, 1, 4).evaluation
+    satin, painted = cost(MATERIALS["satin"]), cost(models.SgdMicrofacet(**GOLD_PAINT))
+    assert 5 < satin < 20 and 15 * satin < painted < 60 * satin
+
+
 def test_points_are_judged_from_the_surfaces_of_the_scene(rng):
     """A ball beside an upright lamp, whose near side faces it: surfaces that face all ways there predict 2.4 times."""
     lamp = models.PolygonLight(LAMP @ np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
@@ -229,9 +263,8 @@ def test_light_is_filtered_where_a_table_costs_more(rng):
     first, second = made.entries
     assert first.path == second.path == "filtered" and second.joined == "room" and made.status == Status.ok
     filtered = made.paths["it"][0].filtered
-    assert 0 < filtered.error < 0.6 * first.error and first.cost == 1000 + 20 * 3 * np.count_nonzero(
-        np.any(np.asarray(filtered.expand), axis=1)
-    )
+    maps = np.count_nonzero(np.any(np.asarray(filtered.expand), axis=1))
+    assert 0 < filtered.error < 0.6 * first.error and first.cost == 65 + 1.9 * 3 * maps
     _, n, v = where = pixels(rng, 512)
     truth = sum(reference.shade_environment_quadrature(brdf, light, n, v) for light in lights.values())
     mean = lambda x: np.mean(np.square(x), axis=0)

@@ -1,7 +1,8 @@
 """What is known of a material and a light: norms of the bands of its slices, and of what points receive."""
 
 import functools
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -15,8 +16,8 @@ from shisd.harmonics import multiply, sphere_rule
 from shisd.harmonics.internal import host_basis, of_order, zonal_norms
 from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
 from shisd.planning._scene import Light
-from shisd.shading import project_light
-from shisd.shading.internal import RIDGE, hemisphere_blocks, project_slice
+from shisd.shading import TransformedSlices, project_light, transform_brdf
+from shisd.shading.internal import RIDGE, as_type, hemisphere_blocks, project_slice
 
 _ELEVATIONS = 12  # of the views whose slices are judged: Gauss nodes
 _AZIMUTHS = 6  # of these views, for anisotropic materials
@@ -33,6 +34,7 @@ class Material:
     isotropic: bool
     elevations: int  # of the tables to be made
     brdf: AbstractBrdf  # itself, which points on lights are evaluated with
+    mapped: dict[int, TransformedSlices] = field(default_factory=dict)  # by degree, what `beyond_maps` has made
 
     @property
     def colours(self) -> int:
@@ -58,6 +60,18 @@ class Material:
         c[..., of_order(self.degree, 0)] -= self.mean_zonal[:, None]
         return _norms(c)
 
+    @functools.cached_property
+    def evaluation(self) -> float:
+        """Nanoseconds that one value of the model takes, by its operations."""
+        direction = jax.ShapeDtypeStruct((3,), np.float32)
+        return _nanoseconds(jax.make_jaxpr(self.brdf.value_cosine)(direction, direction).jaxpr)
+
+    def beyond_maps(self, degree: int) -> TransformedSlices:
+        """Expansions beyond maps of directions, made when first asked for."""
+        if degree not in self.mapped:
+            self.mapped[degree] = transform_brdf(as_type(self.brdf, float), degree, elevations=self.elevations)
+        return self.mapped[degree]
+
     def misfit(self, degree: int) -> np.ndarray:
         """Norms [C, V, l] of what a fit above the horizon leaves there: r = b - H_(:L) (H_LL + ridge)^-1 b_L."""
         square = np.zeros_like(self.norms)
@@ -68,6 +82,20 @@ class Material:
             solution = np.linalg.solve(h[:k, :k] + RIDGE * np.eye(k), h[:k])
             square[..., l] += (b - b[..., :k] @ solution) ** 2
         return np.sqrt(square)
+
+
+_LONG = {"exp", "exp2", "expm1", "log", "log1p", "pow", "sin", "cos", "tan", "atan2", "gather", "while", "scan"}
+
+
+def _nanoseconds(jaxpr: Any) -> float:
+    """On one value: vector code takes 0.05 for an operation, what stands for a table or a series 7."""
+    total = 0.0
+    for equation in jaxpr.eqns:
+        inner = [getattr(x, "jaxpr", x) for x in equation.params.values() if hasattr(x, "jaxpr") or hasattr(x, "eqns")]
+        size = max((math.prod(out.aval.shape) for out in equation.outvars), default=1)
+        own = (7.0 if equation.primitive.name in _LONG else 0.05) * size
+        total += sum(map(_nanoseconds, inner)) if inner else own
+    return total
 
 
 @dataclass(frozen=True, eq=False)

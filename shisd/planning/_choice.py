@@ -1,6 +1,7 @@
 """The choice: for each material and light the cheapest path at the smallest degree, as a table and as what shades."""
 
 import functools
+import math
 import warnings
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,12 +17,13 @@ from shisd._status import Status
 from shisd._typing import Array, Float
 from shisd.decomposition.internal import TABLE_DEGREE
 from shisd.planning._bands import Material, Seen, known_light, known_material
-from shisd.planning._paths import PATHS, Expanded, Filtered, Irradiance, Path, Table
+from shisd.planning._paths import PATHS, Expanded, Filtered, Irradiance, Path, Sampled, Table
 from shisd.planning._prediction import Choice, judge
 from shisd.planning._scene import Scene
 from shisd.shading import Surface, tabulate_brdf
 from shisd.shading.internal import as_type, check_surface, sum_parts
 
+_WORTH = 1.2  # times cheaper
 Judge = Callable[[type[Path], Material, Seen, int], Choice]
 
 
@@ -36,7 +38,7 @@ class Entry(NamedTuple):
     degree: int  # or the order of points
     error: float  # predicted RMS
     bound: float  # on the RMS whatever way materials and lights are turned, from the same bands; of points, the worst
-    cost: float  # multiply-adds per pixel; 0 for a light that joins another
+    cost: float  # nanoseconds per pixel, by a model that ranks paths; 0 for a light that joins another
     joined: str  # the light that it is added to before the path is taken, or ""
     met: bool
 
@@ -69,7 +71,7 @@ class Plan(Module):
         return _shade(self.paths[material], surface)
 
     def __str__(self) -> str:
-        rows = [("material", "light", "path", "degree", "error %", "bound %", "multiply-adds per pixel", "")]
+        rows = [("material", "light", "path", "degree", "error %", "bound %", "ns per pixel", "")]
         for e in self.entries:
             cost = f"0, added to {e.joined}" if e.joined else f"{e.cost:.0f}"
             rows.append((
@@ -108,8 +110,10 @@ def plan(
     each such pair, and for each pixel 16 to 90 times less than by a table of degree 16 or 30 (GGX 0.25, RGB, channels
     to 1e-1 ... 1e-2). Channels have 3/5 of `error` then.
     Lamps and windows may take points on them (`shading.Quadrature`) in place of slices: `degree` of such an entry is
-    the order, its error what 1024 normals at every point show against order 24, or 16,384 views of the scene's own
-    normals, and `bound` the largest of them.
+    the order, its error what 1024 normals at every point show, or 16,384 views of the scene's own normals, and `bound`
+    the largest of them. They are compared with orders of 24 or 48, or where the lobe is too narrow for these with
+    expansions of degree 8 beyond maps of directions (`shading.transform_brdf`, degree 4 or 8, isotropic materials),
+    which lamps that shine alike in all directions may take too: some 10 s to make for each material that needs them.
     Where nothing meets the tolerance, it is a ValueError; with `throw=False` the entry has the best that `max_degree`
     can do and `met` False, the `status` is `tolerance_not_met`, and a UserWarning says so. `progress`: None, True for a
     bar of tqdm, or a function of (done, total) lights and materials.
@@ -117,6 +121,8 @@ def plan(
     gave for three materials at degrees 2 to 12 was 0.65 to 1.06 times the prediction, of the worst colour. One picture
     does not show all orientations: there it was 0.2 to 4.2 times, four of five between 0.35 and 1.85, more for cameras
     that see the sides with the edges of the light. Materials and lights in float32 show nothing below 1e-5.
+    The cheapest is that by a model of times on a CPU (`Entry.cost`), which ranks paths and knows the operations of a
+    material's own model, but no other machine.
     Not traced: it runs on the host and returns what is to be traced.
     Cost: every material is tabulated once, which compiles for each kind of material.
     """
@@ -183,23 +189,31 @@ def _plan(
 
 def _choose(judged: Judge, material: Material, light: Seen, target: float, max_degree: int) -> Choice:
     """The cheapest path that meets the target, or else the one that comes closest."""
-    found = []
+    found: list[Choice] = []
     for path in PATHS:
         if path.takes is light.kind:
-            found.append(_first(judged, path, material, light, target, max_degree))
+            cheapest = min((choice.cost for choice in found if choice.error <= target), default=math.inf) 
+            found.extend(_first(judged, path, material, light, target, max_degree, cheapest))
     good = [choice for choice in found if choice.error <= target]
     return min(good, key=lambda c: c.cost) if good else min(found, key=lambda c: c.error)
 
 
 def _first(
-    judged: Judge, path: type[Path], material: Material, light: Seen, target: float, max_degree: int
-) -> Choice:
-    """A path at the first degree that meets the target, or at the last."""
-    for degree in path.degrees(max_degree):
-        choice = judged(path, material, light, degree)
-        if choice.error <= target:
-            break
-    return choice
+    judged: Judge, path: type[Path], material: Material, light: Seen, target: float, max_degree: int, cheapest: float
+) -> list[Choice]:
+    """A path at degrees up to the first that meets the target, or to the last.
+
+    Samples cost seconds: few of their degrees are tried, and none that would gain little over another path.
+    """
+    degrees, found = list(path.degrees(max_degree)), []
+    if issubclass(path, Sampled):
+        degrees = [degree for degree in degrees if _WORTH * path.cost(material, light, degree) < cheapest]
+    low, high = 0, len(degrees)
+    while low < high:
+        middle = (low + high - 1) // 2 if issubclass(path, Sampled) else low
+        found.append(judged(path, material, light, degrees[middle]))
+        low, high = (low, middle) if found[-1].error <= target else (middle + 1, high)
+    return found
 
 
 def _join(

@@ -20,9 +20,10 @@ from shisd.shading import Prefiltered, Quadrature, Slices, Surface, prefilter, s
 from shisd.shading.internal import as_type, best_channels, finite_mark, finite_or_nan, maps_of, shade_points
 
 _ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
-_EXACT = 24  # the order that others are compared with
+_EXACT = (24, 48)  # orders that others are compared with: the first that the one before comes near
+_NEAR = 1e-3  # relative
+_MAPPED = (4, 8)  # degrees beyond maps
 _FACING = 1024  # normals
-_EVALUATION = 200  # of a model, in multiply-adds: as long as that many of slices
 
 
 class Path(Module):
@@ -47,7 +48,7 @@ class Path(Module):
     @staticmethod
     @abc.abstractmethod
     def cost(material: Material, light: Any, degree: int) -> float:
-        """Multiply-adds per pixel: a model, of the products that grow with the degree."""
+        """Nanoseconds per pixel: a model of what two cores took (docs/benchmarks.md), to rank paths by."""
 
     @classmethod
     @abc.abstractmethod
@@ -87,7 +88,7 @@ class Irradiance(Expanded):
 
     @staticmethod
     def cost(material, light, degree):
-        return float(max(material.colours, light.colours) * (degree + 1) * (2 * degree + 1))
+        return 45.0 + 0.014 * max(material.colours, light.colours) * (degree + 1) * (2 * degree + 1)
 
     @classmethod
     def make(cls, material, slices, lights, degree):
@@ -117,8 +118,9 @@ class Zonal(Expanded):
 
     @staticmethod
     def cost(material, light, degree):
-        n = (degree + 1) ** 2
-        return _lookup_cost(material, degree) + n * (2 * (degree + 1) + max(material.colours, light.colours))
+        colours, n = max(material.colours, light.colours), (degree + 1) ** 2
+        products = colours**2 * n * (2 * (degree + 1) + colours)
+        return 100 * colours + 0.03 * _lookup(material, degree) + 0.025 * products + _azimuth_cost(material, degree)
 
     @classmethod
     def make(cls, material, slices, lights, degree):
@@ -147,7 +149,9 @@ class Table(Expanded):
         series = (degree + 1) ** 3  # of one angle, which all pixels share
         exchange = _bands_squared(degree) / 4
         colours = max(material.colours, light.colours)
-        return _lookup_cost(material, degree) + series * (colours + material.isotropic) + material.colours * exchange
+        products = _lookup(material, degree) + series * (colours + material.isotropic) + material.colours * exchange
+        turning = _azimuth_cost(material, degree) + (0 if material.isotropic else 4000)
+        return material.colours**0.65 * (110 + 0.21 * products**0.8) + turning
 
     @classmethod
     def make(cls, material, slices, lights, degree):
@@ -183,7 +187,7 @@ class Filtered(Expanded):
         n = (degree + 1) ** 2
         c, e = material.coefficients[..., :n], light.coefficients[:, :n]
         orders = best_channels(c, e, material.theta, material.shares, cls.tolerance(material, [light], degree))[1]
-        return 1000.0 + 20 * max(material.colours, light.colours) * maps_of(orders)
+        return 65 + 1.9 * max(material.colours, light.colours) * maps_of(orders)
 
     @classmethod
     def tolerance(cls, material, lights, degree) -> float:
@@ -229,9 +233,10 @@ class Polygon(AboveHorizon):
         if light.light_degree:
             return _product_cost(material, light, degree)
         axes, rows = _axes_and_rows(material, degree)
-        moments = 12 * len(light.light.points) * (degree + 1) * axes
-        weights = rows * axes
-        return _lookup_cost(material, degree) + material.colours * (moments + weights)
+        points = len(light.light.points)
+        moments = 12 * points * (degree + 1) * axes
+        products = _lookup(material, degree) + material.colours * (moments + rows * axes)
+        return 50 + 85 * points + 0.06 * products + _azimuth_cost(material, degree)
 
 
 class Portal(AboveHorizon):
@@ -245,38 +250,50 @@ class Portal(AboveHorizon):
         return _product_cost(material, light, degree)
 
 
-class Points(Path):
+class Sampled(Path):
+    """A path under a local light whose error is what some points of surfaces show."""
+
+    light: Any
+    material: Any
+
+    @staticmethod
+    @abc.abstractmethod
+    def form(material: Material, degree: int) -> Any:
+        """What stands for the material in `shade`."""
+
+    @classmethod
+    def errors(cls, material, light, degree):
+        surface, exact, doubt = _samples(material, light)
+        off = _radiance(cls.form(material, degree), light, surface) - exact
+        return _rms(off) + doubt, np.max(np.abs(off), axis=0), _rms(exact)
+
+    @classmethod
+    def make(cls, material, slices, lights, degree):
+        return cls(light=lights[0].light, material=cls.form(material, degree))
+
+    def shade(self, surface):
+        return shade(self.material, self.light, surface)
+
+
+class Points(Sampled):
     """A polygon light by Gauss points on it, `degree` x `degree` for a quadrilateral."""
 
     name = "points"
     takes = PolygonLight
-    material: Quadrature
-    light: Any
 
     @staticmethod
     def degrees(most):
         return _ORDERS
 
-    @classmethod
-    def errors(cls, material, light, degree):
-        surface, exact = _samples(material, light)
-        off = _by_points(material, light, degree, surface) - exact
-        rms = lambda x: np.sqrt(np.mean(x**2, axis=0))
-        missed = rms(exact) < 0.5 * predict(material.norms, light.norms, material.shares)[0]  # a lobe between points
-        return np.where(missed, np.inf, rms(off)), np.max(np.abs(off), axis=0), rms(exact)
+    @staticmethod
+    def form(material, degree):
+        return Quadrature(as_type(material.brdf, float), degree)
 
     @staticmethod
     def cost(material, light, degree):
-        quads = 1 + (len(light.light.points) - 3) // 2
+        quads = len(light.light.points) // 2  # one more where the horizon cuts
         through = light.colours * (light.light_degree + 1) * (2 * light.light_degree + 1) if light.light_degree else 0
-        return float(quads * degree**2 * (_EVALUATION + through))
-
-    @classmethod
-    def make(cls, material, slices, lights, degree):
-        return cls(Quadrature(as_type(material.brdf, float), degree), lights[0].light)
-
-    def shade(self, surface):
-        return shade(self.material, self.light, surface)
+        return 80 + 30 * quads + quads * degree**2 * (3 + material.evaluation + 0.1 * through)
 
 
 class PortalPoints(Points):
@@ -285,12 +302,39 @@ class PortalPoints(Points):
     takes = PortalLight
 
 
-PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Filtered, Polygon, Portal, Points, PortalPoints)
+class Maps(Sampled):
+    """A polygon that shines alike in all directions, and expansions beyond maps of directions, isotropic ones."""
+
+    name = "maps"
+    takes = PolygonLight
+
+    @staticmethod
+    def serves(material: Material, light: Local) -> bool:
+        return material.isotropic and light.kind is PolygonLight and not light.light_degree
+
+    @staticmethod
+    def degrees(most):
+        return tuple(d for d in _MAPPED if d <= most)
+
+    @staticmethod
+    def form(material, degree):
+        return material.beyond_maps(degree)
+
+    @staticmethod
+    def cost(material, light, degree):
+        if not Maps.serves(material, light):
+            return np.inf
+        return Polygon.cost(material, light, degree) + 0.6 * Polygon.cost(material, light, 2)
+
+PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Filtered, Polygon, Portal, Points, PortalPoints, Maps)
 
 
 @functools.lru_cache(maxsize=1)  # the orders of one pair follow each other
-def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
-    """Points of surfaces, those of the scene or facing all ways, seen as in a sphere's picture; radiance [N, C]."""
+def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray, np.ndarray]:
+    """Points of surfaces, those of the scene or facing all ways, seen as in a sphere's picture.
+
+    And the radiance [N, C], and its RMS error [C] where that is not small.
+    """
     if light.normals is None:
         axes = np.asarray(fibonacci_directions(_FACING // 2), float)
         normals = np.concatenate([axes, -axes])[None]  # [P or 1, N, 3]
@@ -304,14 +348,37 @@ def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray]:
     views = np.sqrt(1 - u) * normals + sine * (np.cos(turn) * across + np.sin(turn) * upon)
     facing, seen, along = (jnp.asarray(a, float) for a in (normals, views, across))
     surface = Surface(facing, seen, jnp.asarray(light.points, float)[:, None], along)
-    return surface, _by_points(material, light, _EXACT, surface)
+    return surface, *_trusted(material, light, surface)
 
 
-def _by_points(material: Material, light: Local, order: int, surface: Surface) -> np.ndarray:
-    """Radiance [N, C]."""
-    brdf, own = as_type((material.brdf, light.light), float)
-    values = np.asarray(shade(Quadrature(brdf, order), own, surface), float)
+def _trusted(material: Material, light: Local, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance by as many points as their number no longer matters, or of lobes too narrow for that beyond maps.
+
+    There the lower degree shows the error of its own, which the higher has in the proportion of their fits.
+    """
+    by_points = lambda order: _radiance(Points.form(material, order), light, surface)
+    radiance = by_points(_ORDERS[-1])
+    for order in _EXACT:
+        coarse, radiance = radiance, by_points(order)
+        doubt = _rms(radiance - coarse)
+        if np.all(doubt <= _NEAR * np.max(_rms(radiance))):
+            return radiance, 0 * doubt
+    missed = _rms(radiance) < 0.5 * predict(material.norms, light.norms, material.shares)[0]  # a lobe between points
+    if np.any(missed) or not Maps.serves(material, light):
+        return radiance, np.where(missed, np.inf, doubt)
+    low, high = (material.beyond_maps(degree) for degree in _MAPPED)
+    coarse, radiance = (_radiance(form, light, surface) for form in (low, high))
+    return radiance, _rms(radiance - coarse) * float(jnp.linalg.norm(high.errors) / jnp.linalg.norm(low.errors))
+
+
+def _radiance(form: Any, light: Local, surface: Surface) -> np.ndarray:
+    """Values [N, C]."""
+    values = np.asarray(shade(form, as_type(light.light, float), surface), float)
     return values.reshape(values.shape[0] * values.shape[1], -1)
+
+
+def _rms(x: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(x**2, axis=0))
 
 
 def _irradiance(points: dict[str, Float[Array, "p 3"]], c: Float[Array, "*colour n"]) -> Float[Array, " p *colour"]:
@@ -329,9 +396,14 @@ def _sum(lights: list[Distant], degree: int) -> Float[Array, "*colour n"]:
     return jnp.asarray(total if any(light.coloured for light in lights) else total[0], float)
 
 
-def _lookup_cost(material: Material, degree: int) -> float:
-    azimuths = 1 if material.isotropic else max(32, 2 * degree + 4) + 2  # cosines and sines
-    return float(material.colours * (material.elevations + 4) * azimuths * _axes_and_rows(material, degree)[1])
+def _lookup(material: Material, degree: int) -> float:
+    """Multiply-adds, of elevations."""
+    return float(material.colours * (material.elevations + 4) * _axes_and_rows(material, degree)[1])
+
+
+def _azimuth_cost(material: Material, degree: int) -> float:
+    """Of slices that turn with the view in their own way."""
+    return 0.0 if material.isotropic else material.colours**0.65 * (700 + 230 * degree)
 
 
 def _axes_and_rows(material: Material, degree: int) -> tuple[int, int]:
@@ -344,7 +416,8 @@ def _product_cost(material: Material, light: Local, degree: int) -> float:
     total = light.light_degree + degree
     moments = 12 * len(light.light.points) * (total + 1) * (2 * total + 1) + (2 * total + 1) * (total + 1) ** 2
     matrix = (total + 1) ** 2 * (degree + 1) ** 2
-    return _lookup_cost(material, degree) + moments + light.colours * (matrix + 2 * _bands_squared(degree))
+    products = _lookup(material, degree) + moments + light.colours * (matrix + 2 * _bands_squared(degree))
+    return 300 + 1.6 * products**0.82 + _azimuth_cost(material, degree)
 
 
 def _bands_squared(degree: int) -> float:

@@ -178,4 +178,18 @@ MUTANTS = [
         new="return max(6 * max(errors), 1e-3)",
         test="tests/test_planning.py::test_light_is_filtered_where_a_table_costs_more",
     ),
+    Mutant(
+        "lobes too narrow for points trusted to them",
+        "shisd/planning/_paths.py",
+        old="if np.any(missed) or not Maps.serves(material, light):",
+        new="if True:",
+        test="tests/test_planning.py::test_maps_are_chosen_for_sharp_materials",
+    ),
+    Mutant(
+        "every value of a model as long as that of another",
+        "shisd/planning/_bands.py",
+        old="own = (7.0 if equation.primitive.name in _LONG else 0.05) * size",
+        new="own = 0.05 * size",
+        test="tests/test_planning.py::test_what_values_of_a_model_cost",
+    ),
 ]

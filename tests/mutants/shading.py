@@ -87,7 +87,7 @@ MUTANTS = [
     ),
     Mutant(
         "a lobe between points is none", "shisd/planning/_paths.py",
-        old="np.where(missed, np.inf, rms(off))", new="rms(off)",
+        old="np.where(missed, np.inf, doubt)", new="doubt",
         test="tests/test_planning.py::test_points_are_chosen_where_they_are_cheapest",
     ),
     Mutant(
