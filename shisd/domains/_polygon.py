@@ -178,8 +178,32 @@ def loop_solid_angle(
 
     The fan starts at the first vertex, or where another is nearly opposite, at `fallback`: where it is given, it is a
     direction that no vertex is more than a quarter turn away from, and the fan adds up to what is meant.
+    Derivatives: in the vertices, along the sphere.
     """
+    return _angle(v, fallback, largest)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _angle(v: Float[Array, "3 s r"], fallback: Float[Array, "3 q"] | None, largest: float) -> Float[Array, " p"]:
     return in_lanes(functools.partial(_fan, largest=largest), (v,) if fallback is None else (v, fallback))
+
+
+def _angle_jvp(largest: float, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """An edge from a to b takes (da + db) . (a x b) / (1 + a . b) away: what an arc sweeps, integrated along it."""
+    (v, fallback), (dv, _) = primals, tangents
+    value = _angle(v, fallback, largest)
+    change = -sum_first(dot(in_lanes(_inward, (v,)), dv + jnp.roll(dv, -1, 1)))
+    return value, jnp.broadcast_to(change, value.shape)
+
+
+_angle.defjvp(_angle_jvp)
+
+
+def _inward(v: Float[Array, "3 s r"]) -> Float[Array, "3 s r"]:
+    """(a x b) / (1 + a . b) of all edges: normals by the tangent of half of their length."""
+    chord, middle = sides(v)
+    short = dot(chord, chord) < dot(middle, middle)
+    return 2 * cross(v, jnp.where(short[None], chord, middle)) / dot(middle, middle)[None]
 
 
 def _fan(

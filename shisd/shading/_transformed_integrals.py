@@ -12,7 +12,7 @@ frame given, v = in that of the plane, x, y, z with z the normal.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -74,8 +74,26 @@ def _of_map(
     *,
     even: bool,
 ) -> Float[Array, "c p"]:
+    return _of_rows(lobes, base, *_beyond(s, v, even), v, degree, spare, even=even)
+
+
+def _beyond(s: Float[Array, "5 p"], v: Loop, even: bool) -> tuple[Loop, Float[Array, "3 p"]]:
+    return in_lanes(functools.partial(_mapped, even=even), (s, v))
+
+
+def _of_rows(
+    lobes: Float[Array, "c rows p"],
+    base: Float[Array, "c k p"],
+    mapped: Loop,
+    up: Float[Array, "3 p"],
+    v: Loop,
+    degree: int,
+    spare: int,
+    *,
+    even: bool,
+) -> Float[Array, "c p"]:
+    """Expansions over the mapped outline, and bases over the outline itself."""
     inverse = incidence_inverse if even else zonal_inverse
-    mapped, up = in_lanes(functools.partial(_mapped, even=even), (s, v))
     wide, plain = loop_solid_angle(mapped, 2 * np.pi, up), angle_above(v)
 
     def of_colour(rows: tuple[Array, Array]) -> Float[Array, " p"]:
@@ -96,11 +114,15 @@ def _mapped(s: Float[Array, "5 q"], v: Float[Array, "3 s r"], *, even: bool) -> 
     return mapped, on_sphere(up[:, None])[:, 0]
 
 
-def _in_plane(tables: Tables, theta: Float[Array, " p"], v: Loop, degree: int, spare: int) -> Float[Array, "c p"]:
+def _rows(tables: Tables, theta: Float[Array, " p"], degree: int) -> tuple[Array, Array, Array]:
+    """Maps [5, p], expansions and bases [c, rows, p] towards views of these elevations."""
     s, lobes, base = (rows_at(table, theta, d) for table, d in zip(tables, (2, degree, BASE), strict=True))
     s = s[-3:]
-    s = jnp.concatenate([jnp.zeros_like(s[:2]), s])
-    return _of_map(s, lobes, base, v, degree, spare, even=True)
+    return jnp.concatenate([jnp.zeros_like(s[:2]), s]), lobes, base
+
+
+def _in_plane(tables: Tables, theta: Float[Array, " p"], v: Loop, degree: int, spare: int) -> Float[Array, "c p"]:
+    return _of_map(*_rows(tables, theta, degree), v, degree, spare, even=True)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
@@ -109,44 +131,58 @@ def _even_integrals(tables: Tables, view: Float[Array, "p 3"], u: Loop, degree: 
 
 
 def _even_integrals_jvp(degree, spare, primals, tangents):
+    """The outline moves, and what is looked up; where it moves with theta alone, so does one number for each pixel."""
     (tables, view, u), (d_tables, d_view, du) = primals, tangents
     theta, (cos, sin) = _views.elevation(view), _views.azimuth(view)
     v, sine = turned(u, cos, sin), jnp.sin(theta)
-    moved: dict[str, tuple[Any, Any]] = {}
-    extra = None
-    if not any(isinstance(d, SymbolicZero) for d in d_tables):
-        moved["tables"] = (tables, d_tables)
-    dv = None if isinstance(du, SymbolicZero) else turned(du, cos, sin)
+    rows = lambda theta: _rows(tables, theta, degree)
+    (s, lobes, base), (s_rises, lobes_rise, base_rises) = jax.jvp(rows, (theta,), (jnp.ones_like(theta),))
+    mapped, up = _beyond(s, v, True)
+    value = _of_rows(lobes, base, mapped, up, v, degree, spare, even=True)
+    change, ds, dv = jnp.zeros_like(value), jnp.zeros_like(s), jnp.zeros_like(v)
+    if not isinstance(d_tables[0], SymbolicZero):
+        change += jax.jvp(lambda t: _in_plane(t, theta, v, degree, spare), (tables,), (d_tables,))[1]
+    if not isinstance(du, SymbolicZero):
+        dv += turned(du, cos, sin)
     if not isinstance(d_view, SymbolicZero):
         dx, dy, dz = d_view.T
-        moved["theta"] = (theta, view[:, 2] * (cos * dx + sin * dy) - sine * dz)
+        d_theta = view[:, 2] * (cos * dx + sin * dy) - sine * dz
+        change += _of_rows(lobes_rise, base_rises, mapped, up, v, degree, spare, even=True) * d_theta[None]
+        ds += s_rises * d_theta[None]
         across, steep = cos * dy - sin * dx, sine < _STEEP
-        turn = back(v) * (across * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine)))[None, None]
-        dv = turn if dv is None else dv + turn
-        extra = _at_normal(tables, v, steep, jnp.where(steep, across, 0), degree, spare)
-    if dv is not None:
-        moved["v"] = (v, dv)
-    fixed = {"tables": tables, "theta": theta, "v": v}
-    of_moved = lambda moved: _in_plane(**(fixed | moved), degree=degree, spare=spare)
-    at, by = ({name: pair[k] for name, pair in moved.items()} for k in (0, 1))
-    value, change = jax.jvp(of_moved, (at,), (by,))
-    return value, change if extra is None else change + extra
+        dv += back(v) * (across * jnp.where(steep, 0, 1 / jnp.where(steep, 1, sine)))[None, None]
+        change += _at_normal(tables, v, steep, degree, spare) * jnp.where(steep, across, 0)[None]
+    if not (isinstance(du, SymbolicZero) and isinstance(d_view, SymbolicZero)):
+        change += _moves((s, lobes, base), v, ds, dv, degree, spare)
+    return value, change
 
 
 _even_integrals.defjvp(_even_integrals_jvp, symbolic_zeros=True)
 
 
-def _at_normal(
-    tables: Tables, v: Loop, steep: Bool[Array, " p"], across: Float[Array, " p"], degree: int, spare: int
+def _moves(
+    rows: tuple[Array, Array, Array], v: Loop, ds: Float[Array, "5 p"], dv: Loop, degree: int, spare: int
 ) -> Float[Array, "c p"]:
-    """The change with a step across the plane of views next to the normal, where they are `steep`; 0 elsewhere."""
+    """The change as the map and the outline move."""
+    s, lobes, base = rows
+    (mapped, up), (d_mapped, _) = jax.jvp(lambda s, v: _beyond(s, v, True), (s, v), (ds, dv))
+    up = jax.lax.stop_gradient(up)  # no angle depends on it
+    over = lambda mapped, v: _of_rows(lobes, base, mapped, up, v, degree, spare, even=True)
+    return jax.jvp(over, (mapped, v), (d_mapped, dv))[1]
+
+
+def _at_normal(
+    tables: Tables, v: Loop, steep: Bool[Array, " p"], degree: int, spare: int
+) -> Float[Array, "c p"]:
+    """The change with a step across the plane of views next to the normal, if any are `steep`, or else 0."""
     none = lambda: jnp.zeros((tables.lobes.shape[0], v.shape[2]), v.dtype)
 
     def next_to_it() -> Float[Array, "c p"]:
         both = jnp.concatenate([v, v * jnp.asarray([-1, -1, 1], v.dtype)[:, None, None]], axis=2)
-        move = back(both) * jnp.concatenate([across, -across])[None, None] / (2 * _STEEP)
-        near = jnp.full_like(both[0, 0], _STEEP)
-        turns = jax.jvp(lambda v: _in_plane(tables, near, v, degree, spare), (both,), (move,))[1]
+        side = jnp.concatenate([jnp.ones_like(v[0, 0]), -jnp.ones_like(v[0, 0])])
+        move = back(both) * side[None, None] / (2 * _STEEP)
+        rows = _rows(tables, jnp.full_like(both[0, 0], _STEEP), degree)
+        turns = _moves(rows, both, jnp.zeros_like(rows[0]), move, degree, spare)
         return turns[:, : v.shape[2]] + turns[:, v.shape[2] :]
 
     return jax.lax.cond(jnp.any(steep), next_to_it, none)

@@ -48,7 +48,7 @@ MUTANTS = [
     ),
     Mutant(
         "no change across the plane at the normal", "shisd/shading/_transformed_integrals.py",
-        old="change if extra is None else change + extra", new="change",
+        old="change += _at_normal(tables, v, steep", new="change += 0 * _at_normal(tables, v, steep",
         test=BEYOND + "test_derivatives_in_everything[True]",
     ),
     Mutant(
@@ -84,6 +84,21 @@ MUTANTS = [
         "fans leave out their last corner", "shisd/shading/_quadrature.py",
         old="np.minimum(first + 2, slots - 1)", new="first + 1",
         test=POINTS + "test_radiance_of_the_model[six corners]",
+    ),
+    Mutant(
+        "arcs that sweep half of their solid angle", "shisd/domains/_polygon.py",
+        old="return 2 * cross(v, jnp.where(", new="return cross(v, jnp.where(",
+        test="tests/domains/test_polygon.py",
+    ),
+    Mutant(
+        "what is looked up beyond maps stays as views rise", "shisd/shading/_transformed_integrals.py",
+        old="change += _of_rows(lobes_rise", new="change += 0 * _of_rows(lobes_rise",
+        test="tests/shading/test_transformed.py",
+    ),
+    Mutant(
+        "maps that stay as views rise", "shisd/shading/_transformed_integrals.py",
+        old="ds += s_rises * d_theta[None]", new="ds += 0 * s_rises * d_theta[None]",
+        test="tests/shading/test_transformed.py",
     ),
     Mutant(
         "a lobe between points is none", "shisd/planning/_paths.py",
