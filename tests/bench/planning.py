@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -180,7 +181,7 @@ def bench_tolerances(tolerances=(0.1, 0.03, 0.01), max_degree=30, timed=(0.1, 0.
                 slower = None
                 if tolerance in timed and len(ways) > 1:
                     new = {key: make(way) for key, way in ways.items() if key not in seconds}
-                    calls = {key: lambda surface, way=way: way.shade(surface) for key, way in new.items()}
+                    calls = {key: functools.partial(shade_by, way) for key, way in new.items()}
                     if calls:
                         seconds |= {key: t.best for key, t in interleaved(calls, crowd, seconds=1.0).items()}
                     slower = seconds[chosen.path.name, chosen.degree] / min(seconds[key] for key in ways)
@@ -189,6 +190,11 @@ def bench_tolerances(tolerances=(0.1, 0.03, 0.01), max_degree=30, timed=(0.1, 0.
                       key, way in ways.items() if key in seconds}, flush=True)  # fmt: skip
         jax.clear_caches()  # what is compiled for hundreds of plans is more than a process may map
     return [kept(tolerance, [x[1:] for x in found if x[0] == tolerance]) for tolerance in tolerances]
+
+
+@eqx.filter_jit
+def shade_by(path, surface):
+    return path.shade(surface)
 
 
 def made(material, slices, light, choice):
