@@ -44,12 +44,15 @@ COUNT, JUDGED = 16384, 256
 TILE, SMALL = 4096, 256  # pixels at a time: of loops over samples; of long formulas and of derivatives
 PROJECTIONS, PROJECTIONS_JUDGED = 2048, 32
 LIGHT_DEGREE = 12
-ALPHA = {"GGX 0.5": 0.5, "GGX 0.25": 0.25, "GGX 0.1": 0.1}
+ALPHA = {f"GGX {alpha:g}": alpha for alpha in (0.5, 0.25, 0.1, 0.05, 0.02)}
+NODES, STEPS = 8, 3.0 ** -np.arange(6)  # of references: in every cell; from where a light is cut
 QUADS = {  # counter-clockwise seen from where they shine
     "floor": np.array([[-0.5, -0.5, 1.0], [-0.5, 0.5, 1.2], [0.5, 0.5, 1.2], [0.5, -0.5, 1.0]], np.float32),
     "wall": np.array([[1, 0, 0], [-1, 0, 0], [-1, 0, 1], [1, 0, 1]], np.float32),
+    "small": np.array([[-0.15, -0.13, 2.0], [-0.15, 0.13, 2.15], [0.15, 0.13, 2.15], [0.15, -0.13, 2.0]], np.float32),
 }
-AREAS = {"floor": ([-2, -2], [2, 2]), "wall": ([-1.5, 0.1], [1.5, 2])}
+AREAS = {"floor": ([-2, -2], [2, 2]), "wall": ([-1.5, 0.1], [1.5, 2]), "small": ([-2, -2], [2, 2])}
+TITLES = {"floor": "floor below a panel", "wall": "floor beside a screen", "small": "floor below a small lamp"}
 
 
 def unit(x):
@@ -213,7 +216,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
             add(family, f"degree {degree}", kernel, area_lights.slices(table), setup=seconds)
     return Task(
         f"polygon-lit {scene}, {name}",
-        f"{name}, {'floor below a panel' if scene == 'floor' else 'floor beside a screen'}",
+        f"{name}, {TITLES[scene]}",
         "pixel",
         (QUADS[scene], *points(scene)),
         stored[f"{scene} {name}"],
@@ -317,6 +320,52 @@ def relative(a, b) -> float:
     return float(np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)))
 
 
+def cells_of(quad, positions, normals, views) -> np.ndarray:
+    """Parts [N, cells, 4, 3] of a parallelogram, narrow where a point's mirror direction meets it, and below the point.
+
+    Where the mirror direction misses it, that is where the half vector is nearest to the normal. Some have no area.
+    """
+    grid = np.linspace(0, 1, 201)
+    u, v = (x.ravel() for x in np.meshgrid(grid, grid, indexing="ij"))
+    at = lambda u, v: quad[0] + u[..., None] * (quad[1] - quad[0]) + v[..., None] * (quad[3] - quad[0])
+    cells = []
+    for position, normal, view in zip(positions, normals, views, strict=True):
+        mirror = 2 * (normal @ view) * normal - view
+        sides = np.stack([quad[1] - quad[0], quad[3] - quad[0], -mirror], axis=1)
+        hit = np.linalg.solve(sides, position - quad[0])
+        offset = at(u, v) - position
+        if not (hit[2] > 0 and np.all((hit[:2] >= 0) & (hit[:2] <= 1))):
+            best = np.argmax(unit(unit(offset) + view) @ normal)
+            hit = np.array([u[best], v[best]])
+        nearest = np.argmin(np.sum(offset**2, axis=1))
+        cuts = [_cuts(hit[i], (u, v)[i][nearest]) for i in range(2)]
+        a, b, c, d = (np.meshgrid(cuts[0][i], cuts[1][j], indexing="ij") for i, j in CORNERS)
+        cells.append(np.stack([at(*x) for x in (a, b, c, d)], axis=2).reshape(-1, 4, 3))
+    return np.stack(cells)
+
+
+CORNERS = [(slice(None, -1), slice(None, -1)), (slice(1, None), slice(None, -1)), (slice(1, None), slice(1, None)),
+           (slice(None, -1), slice(1, None))]  # fmt: skip
+
+
+def _cuts(*places: float) -> np.ndarray:
+    """From 0 to 1, closer by thirds to each place."""
+    parts = [p + np.concatenate([-STEPS, [0], STEPS]) for p in places]
+    return np.sort(np.clip(np.concatenate([[0, 1], *parts]), 0, 1))
+
+
+@eqx.filter_jit
+def _sum_of_cells(brdf, radiance, cells, positions, normals, views, nodes: int):
+    """The reference [N], over every part of the light."""
+
+    def one(row):
+        cells, *at = row
+        judge = lambda quad: reference.shade_polygon_quadrature(brdf, quad, radiance, *(x[None] for x in at), nodes=nodes)
+        return jnp.sum(jax.vmap(judge)(cells))
+
+    return jax.lax.map(one, (cells, positions, normals, views))
+
+
 def make() -> None:
     stored = {"portal light": distant_light()}
 
@@ -328,15 +377,13 @@ def make() -> None:
     with jax.enable_x64(True):
         light = jnp.asarray(stored["portal light"], float)
         expansion = lambda w: harmonics.evaluate(light, w)
-        jobs = [("floor", name, 1.0, f"floor {name}", 64) for name in ALPHA]
-        jobs += [("wall", name, 1.0, f"wall {name}", 128) for name in ("GGX 0.5", "GGX 0.25")]
-        jobs += [("floor", "GGX 0.5", expansion, "portal GGX 0.5", 32)]
-        for scene, name, radiance, key, nodes in jobs:
+        jobs = [(scene, name, 1.0, f"{scene} {name}") for scene in QUADS for name in ALPHA]
+        jobs += [("floor", "GGX 0.5", expansion, "portal GGX 0.5")]
+        for scene, name, radiance, key in jobs:
             rows = [x[:JUDGED].astype(float) for x in points(scene)]
-            judge = lambda nodes, name=name, scene=scene, radiance=radiance, rows=rows: np.asarray(
-                reference.shade_polygon_quadrature(brdf(name), QUADS[scene].astype(float), radiance, *rows, nodes=nodes)
-            )
-            add(key, judge(nodes), judge(3 * nodes // 4))
+            cells = cells_of(QUADS[scene].astype(float), *rows)
+            judge = lambda nodes, *at: np.asarray(_sum_of_cells(brdf(at[0]), radiance, *at[1:], nodes))
+            add(key, *(judge(nodes, name, cells, *rows) for nodes in (NODES, 3 * NODES // 4)))
     seen = [unit(QUADS["floor"].astype(float) - p) for p in points("floor")[0][:PROJECTIONS_JUDGED]]
 
     def coefficients(nodes):
