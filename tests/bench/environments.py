@@ -1,7 +1,8 @@
 """A sphere of 128 x 128 pixels lit by a map, four materials and three maps, seen from one side up to 80 degrees.
 
-The reference is quadrature over every texel, each in four parts, in float64 (`shisd.reference`): python -m
-tests.bench.environments --make. Its error is the difference to sixteen parts, of a few pixels.
+The reference is quadrature over every texel, each in four parts, in sixteen for alphas below 0.1, in float64
+(`shisd.reference`): python -m tests.bench.environments --make. Its error is the difference to four times as many parts,
+of a few pixels.
 
 ours: slices by view, `shading.shade` with a `DistantLight`; maps filtered for the material, `shading.prefilter`; for
 clay also its irradiance, ISD15 Eq. 13.
@@ -38,9 +39,7 @@ FITTED = STORED.with_name("gaussians_environments.npz")
 COPPER = np.array([0.955, 0.638, 0.538])
 MATERIALS = {
     "clay": models.Lambertian(np.full(3, 0.8)),
-    "GGX 0.5": models.Ggx(0.5, COPPER),
-    "GGX 0.25": models.Ggx(0.25, COPPER),
-    "GGX 0.1": models.Ggx(0.1, COPPER),
+    **{f"GGX {alpha:g}": models.Ggx(alpha, COPPER) for alpha in (0.5, 0.25, 0.1, 0.05, 0.02)},
 }
 MAPS = ("interior", "studio", "sun")
 DEGREES, VIEWS = (4, 8, 16, 30), 32
@@ -292,9 +291,15 @@ def fit(material: str, count: int):
     return jax.vmap(decomposition.GaussianLobes)(*(jnp.asarray(part) for part in parts)), float(seconds)
 
 
-def make_fits():
-    arrays = {}
-    for material, brdf in MATERIALS.items():
+def stored_arrays(path: Path, chosen) -> dict:
+    """What is there, unless all materials are made again."""
+    return {} if set(chosen) == set(MATERIALS) else dict(np.load(path))
+
+
+def make_fits(chosen):
+    arrays = stored_arrays(FITTED, chosen)
+    for material in chosen:
+        brdf = MATERIALS[material]
         for count in (1, 3, 7):
             kind, name = f"{type(brdf).__name__}, {count} Gaussians", f"{material}, {count}"
             table, seconds = timed(lambda brdf=brdf, count=count: lobes.fit_table(brdf, count), kind)
@@ -341,17 +346,18 @@ def tasks(quick: bool) -> Iterator[Task]:
 # --- references
 
 
-def make_references():
-    arrays = {}
+def make_references(chosen):
+    arrays = stored_arrays(STORED, chosen)
     normals, views = (np.asarray(a[:JUDGED], float) for a in pixels())
     for name in MAPS:
         texels = np.asarray(environment(name).texels, float)
-        for material, brdf in MATERIALS.items():
+        for material in chosen:
+            parts = 4 if float(MATERIALS[material].lobe_width) < 0.08 else 2
             with jax.enable_x64(True):
-                brdf = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), brdf)
+                brdf = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), MATERIALS[material])
                 shade = functools.partial(reference.shade_environment_quadrature, brdf, models.Environment(texels))
-                values = np.asarray(shade(normals, views, supersampling=2))
-                finer = np.asarray(shade(normals[:16], views[:16], supersampling=4))
+                values = np.asarray(shade(normals, views, supersampling=parts))
+                finer = np.asarray(shade(normals[:16], views[:16], supersampling=2 * parts))
             error = np.sqrt(np.mean((values[:16] - finer) ** 2) / np.mean(finer**2))
             arrays[f"{material}, {name}"], arrays[f"{material}, {name}: error"] = values, error
             print(f"{material}, {name}: RMS {np.sqrt(np.mean(values**2)):.4g}, error {error:.1e}", flush=True)
@@ -361,6 +367,7 @@ def make_references():
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--make", action="store_true", required=True, help="make the stored references and fits again")
-    parser.parse_args()
-    make_fits()
-    make_references()
+    parser.add_argument("--only", choices=MATERIALS, action="append", help="of these materials; the others stay")
+    chosen = parser.parse_args().only or list(MATERIALS)
+    make_fits(chosen)
+    make_references(chosen)

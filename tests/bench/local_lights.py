@@ -35,7 +35,7 @@ import numpy as np
 
 from shisd import harmonics, models, reference, shading
 from shisd.io.internal import write_atomically
-from tests.bench import area_lights, lobes, polygons
+from tests.bench import area_lights, lobes, planned, polygons
 from tests.bench.harness import Method, Task, run
 from tests.truth import scipy_basis, triangle_rule
 
@@ -86,6 +86,11 @@ def lanes(name: str):
 
 def lit_by_polygon(parameters, quad, positions, normals, views):
     return shading.shade(parameters, models.PolygonLight(quad), shading.Surface(normals, views, positions))
+
+
+def lit_by_plan(plan, quad, positions, normals, views):
+    """The plan holds the light."""
+    return plan.shade(planned.NAME, shading.Surface(normals, views, positions))
 
 
 def lit_through_portal(parameters, quad, positions, normals, views):
@@ -172,13 +177,14 @@ def fitted_gaussians(name: str, count: int):
 def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
     half = slice(None, None, 2) if quick else slice(None)
     with_gradients = not quick and (scene, name) == ("floor", "GGX 0.5")
-    methods, material = [], lanes(name)
+    methods, material, where = [], lanes(name), points(scene)
+    narrow = ALPHA[name] < 0.1
 
     def add(family, setting, forward, parameters, differentiated=None, **more):
         gradient = radiance_gradient(differentiated) if with_gradients and differentiated is not None else None
         methods.append(Method(family, setting, forward, parameters, gradient, **more))
 
-    for degree in (4, 12) if quick else (4, 6, 8, 12, 20):
+    for degree in (20,) if narrow else (4, 12) if quick else (4, 6, 8, 12, 20):
         table, seconds = fitted_slices(name, degree)
         differentiated = lit_by_polygon if degree == 8 else None  # compiling a derivative takes 10 s
         add("shisd", f"degree {degree}", lit_by_polygon, table, differentiated, setup=seconds, ours=True)
@@ -187,29 +193,30 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
         differentiated = lit_by_polygon if degree == 8 else None
         setting = f"degree {degree}"
         add("shisd, beyond maps", setting, lit_by_polygon, table, differentiated, setup=seconds, ours=True)
-    for order in (2, 4, 8)[half]:
+    for order in (2, 4, 8, 16)[half]:
         differentiated = lit_by_polygon if order == 4 else None
         model = shading.Quadrature(brdf(name), order)
         add("shisd, points", f"{order} x {order}", lit_by_polygon, model, differentiated, ours=True)
+    methods += planned.methods(lit_by_plan, brdf(name), models.PolygonLight(QUADS[scene]), where[0], where[1])
     for family, kernel, differentiable in (
         ("Gauss points", area_lights.gauss_points, True),
         ("Monte Carlo, solid angle", area_lights.by_solid_angle, True),
         ("Monte Carlo, BRDF", area_lights.by_brdf, False),
         ("Monte Carlo, MIS", area_lights.by_both, False),
     ):
-        for side in (2, 4, 8, 16)[half]:
-            gauss = family == "Gauss points"
+        gauss = family == "Gauss points"
+        for side in (4, 8, 16, 32) if gauss and narrow else (2, 4, 8, 16)[half]:
             count, setting = (side, f"{side} x {side}") if gauss else (side * side, f"{side * side} samples")
             small = shaded(kernel, count, size=SMALL) if differentiable and side == 4 else None
             add(family, setting, shaded(kernel, count), material, small)
     table, seconds = fitted_cosines(name)
     kernel = shaded(area_lights.transformed_cosines, size=SMALL)
     add("linearly transformed cosines", "64 views", kernel, table, kernel, setup=seconds)
-    for count in () if quick else (1, 3):
+    for count in () if quick else (1, 3) if name == "GGX 0.25" else (1,):
         table, seconds = fitted_gaussians(name, count)
         kernel = shaded(area_lights.gaussians, 4, size=SMALL)
         add("spherical Gaussians", f"{count} for a view", kernel, table, setup=seconds)
-    for degree in (4,) if quick else (4, 8, 12):
+    for degree in () if ALPHA[name] < 0.25 else (4,) if quick else (4, 8, 12):
         table, seconds = fitted_slices(name, degree)
         for family, kernel in (("SH rotation", area_lights.turned_harmonics), ("axial moments", area_lights.axial)):
             kernel = shaded(kernel, degree, size=128)
@@ -218,7 +225,7 @@ def polygon_task(scene: str, name: str, stored, quick: bool) -> Task:
         f"polygon-lit {scene}, {name}",
         f"{name}, {TITLES[scene]}",
         "pixel",
-        (QUADS[scene], *points(scene)),
+        (QUADS[scene], *where),
         stored[f"{scene} {name}"],
         float(stored[f"{scene} {name} error"]),
         methods,
@@ -297,8 +304,7 @@ def tasks(quick: bool) -> list[Task]:
     if quick:
         return [polygon_task("floor", "GGX 0.5", stored, True), projection_task(8, stored, True)]
     return [
-        *(polygon_task("floor", name, stored, False) for name in ALPHA),
-        *(polygon_task("wall", name, stored, False) for name in ("GGX 0.5", "GGX 0.25")),
+        *(polygon_task(scene, name, stored, False) for scene in QUADS for name in ALPHA),
         portal_task("GGX 0.5", stored),
         *(projection_task(degree, stored, False) for degree in (8, 30)),
     ]
