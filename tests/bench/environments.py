@@ -5,13 +5,16 @@ The reference is quadrature over every texel, each in four parts, in sixteen for
 of a few pixels.
 
 ours: slices by view, `shading.shade` with a `DistantLight`; maps filtered for the material, `shading.prefilter`; for
-clay also its irradiance, ISD15 Eq. 13.
+clay also its irradiance, ISD15 Eq. 13; what is planned (tests/bench/planned.py).
 Monte Carlo, point lights: tests/bench/monte_carlo.py. SH rotation: tests/bench/sh_rotation.py, on the same slices.
 Split sum: tests/bench/split_sum.py. Spherical Gaussians: tests/bench/lobes.py.
 Gradients: value and derivatives in normals, views, and the light's coefficients, texels or filtered texels, of a sum
 over all pixels and colours; with one map, one material and some settings, as their cost depends on no numbers.
 `setup` leaves compiling out: tables of the material and of the map, projection, fits (stored, with their seconds). For
 every degree of ours and of SH rotation it is that of the highest degree, whose table they share.
+
+Left out, as they are far off or only slower: for alphas below 0.1, ours without filtering below degree 30, and
+filtering at degree 30; for alphas below 0.25, SH rotation.
 
 To add a family: a function of a Scene that returns its methods, listed in FAMILIES.
 """
@@ -29,7 +32,7 @@ import numpy as np
 
 from shisd import decomposition, harmonics, models, reference, shading
 from shisd.io.internal import write_atomically
-from tests.bench import lobes, monte_carlo, sh_rotation, split_sum
+from tests.bench import lobes, monte_carlo, planned, sh_rotation, split_sum
 from tests.bench.harness import Method, Task
 from tests.bench.timing import timed
 
@@ -43,6 +46,7 @@ MATERIALS = {
 }
 MAPS = ("interior", "studio", "sun")
 DEGREES, VIEWS = (4, 8, 16, 30), 32
+FILTERED = {"GGX 0.1": (30, 64, 128), "GGX 0.05": (128, 255), "GGX 0.02": (255,)}  # degrees; of the others 30
 DIFFERENTIATED = {"degree 16", "tolerance 0.02", "16", "64 x 128 map", "3 lobes"}  # settings
 PARTS = ("directions", "sharpness", "weights")  # of a table of Gaussians
 
@@ -65,6 +69,11 @@ class Scene:
     @property
     def glossy(self):
         return self.material != "clay"
+
+    @property
+    def alpha(self):
+        """1 of what is not glossy."""
+        return float(self.brdf.alpha) if self.glossy else 1.0
 
     def some(self, settings):
         """All settings, or the first two."""
@@ -142,7 +151,8 @@ def shisd(scene: Scene) -> list[Method]:
     light, projection = coefficients(scene.map)
     own = {"setup": seconds + projection, "ours": True}
     methods = []
-    for degree in scene.some(DEGREES) if scene.glossy else (2, *scene.some(DEGREES)):
+    degrees = scene.some(DEGREES) if scene.alpha > 0.08 else DEGREES[-1:]
+    for degree in degrees if scene.glossy else (2, *degrees):
         parameters = {"material": by_degree[degree], "light": light[:, : (degree + 1) ** 2]}
         forward, gradient = functions(shade, "light")
         methods.append(Method("shisd", f"degree {degree}", forward, parameters, gradient, **own))
@@ -170,7 +180,7 @@ def filtered_radiance(parameters, normals, views):
 
 def prefiltered(scene: Scene) -> list[Method]:
     methods = []
-    for degree in (30,) if scene.quick or scene.material != "GGX 0.1" else (30, 64):
+    for degree in (30,) if scene.quick else FILTERED.get(scene.material, (30,)):
         material, seconds = sharp_table(scene.material, degree)
         light = models.DistantLight(coefficients(scene.map)[0][:, : (degree + 1) ** 2])
         tolerances = (0.1, 0.05, 0.02, 0.005) if degree == 30 else (0.01,)
@@ -184,6 +194,14 @@ def prefiltered(scene: Scene) -> list[Method]:
             own = {"setup": seconds + filtering, "ours": True}
             methods.append(Method(f"shisd, filtered {degree}", setting, forward, parameters, gradient, **own))
     return methods
+
+
+def shade_by_plan(plan, normals, views):
+    return plan.shade(planned.NAME, shading.Surface(normals, views))
+
+
+def choices(scene: Scene) -> list[Method]:
+    return planned.methods(shade_by_plan, scene.brdf, environment(scene.map))
 
 
 # --- others
@@ -241,6 +259,8 @@ def _slices(table, local):
 
 
 def rotations(scene: Scene) -> list[Method]:
+    if scene.alpha < 0.2:
+        return []
     by_degree, seconds = slices(scene.material)
     light, projection = coefficients(scene.map)
     methods = []
@@ -325,7 +345,7 @@ def gaussians(scene: Scene) -> list[Method]:
     return methods
 
 
-FAMILIES = (shisd, prefiltered, estimators, fixed_lights, rotations, split_sums, gaussians)
+FAMILIES = (shisd, prefiltered, choices, estimators, fixed_lights, rotations, split_sums, gaussians)
 
 
 def tasks(quick: bool) -> Iterator[Task]:

@@ -1,8 +1,9 @@
 """What `planning.plan` chooses for one material under one light, beside what is chosen by hand.
 
 For every tolerance from 10 % to 0.1 %, of all colours together; what was chosen at a larger one is left out, and so is
-planning where that still holds. Where no path meets a tolerance, it is the nearest, and the last. Settings name the tolerance, the path and its degree, or the order
-of points. `setup`: the seconds of planning, compiling included where it is the first of its kind.
+planning where that still holds. Where no path meets a tolerance, it is the nearest, and the last. Settings name the
+tolerance, the path and its degree, or the order of points. `setup`: the seconds of planning, compiling included where
+it is the first of its kind.
 """
 
 import dataclasses
