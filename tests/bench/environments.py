@@ -1,16 +1,20 @@
 """A sphere of 128 x 128 pixels lit by a map, four materials and three maps, seen from one side up to 80 degrees.
 
-The reference is quadrature over every texel, each in four parts, in float64 (`shisd.reference`): python -m
-tests.bench.environments --make. Its error is the difference to sixteen parts, of a few pixels.
+The reference is quadrature over every texel, each in four parts, in sixteen for alphas below 0.1, in float64
+(`shisd.reference`): python -m tests.bench.environments --make. Its error is the difference to four times as many parts,
+of a few pixels.
 
 ours: slices by view, `shading.shade` with a `DistantLight`; maps filtered for the material, `shading.prefilter`; for
-clay also its irradiance, ISD15 Eq. 13.
+clay also its irradiance, ISD15 Eq. 13; what is planned (tests/bench/planned.py).
 Monte Carlo, point lights: tests/bench/monte_carlo.py. SH rotation: tests/bench/sh_rotation.py, on the same slices.
 Split sum: tests/bench/split_sum.py. Spherical Gaussians: tests/bench/lobes.py.
 Gradients: value and derivatives in normals, views, and the light's coefficients, texels or filtered texels, of a sum
 over all pixels and colours; with one map, one material and some settings, as their cost depends on no numbers.
 `setup` leaves compiling out: tables of the material and of the map, projection, fits (stored, with their seconds). For
 every degree of ours and of SH rotation it is that of the highest degree, whose table they share.
+
+Left out, as they are far off or only slower: for alphas below 0.1, ours without filtering below degree 30, and
+filtering at degree 30; for alphas below 0.25, SH rotation.
 
 To add a family: a function of a Scene that returns its methods, listed in FAMILIES.
 """
@@ -28,7 +32,7 @@ import numpy as np
 
 from shisd import decomposition, harmonics, models, reference, shading
 from shisd.io.internal import write_atomically
-from tests.bench import lobes, monte_carlo, sh_rotation, split_sum
+from tests.bench import lobes, monte_carlo, planned, sh_rotation, split_sum
 from tests.bench.harness import Method, Task
 from tests.bench.timing import timed
 
@@ -38,12 +42,11 @@ FITTED = STORED.with_name("gaussians_environments.npz")
 COPPER = np.array([0.955, 0.638, 0.538])
 MATERIALS = {
     "clay": models.Lambertian(np.full(3, 0.8)),
-    "GGX 0.5": models.Ggx(0.5, COPPER),
-    "GGX 0.25": models.Ggx(0.25, COPPER),
-    "GGX 0.1": models.Ggx(0.1, COPPER),
+    **{f"GGX {alpha:g}": models.Ggx(alpha, COPPER) for alpha in (0.5, 0.25, 0.1, 0.05, 0.02)},
 }
 MAPS = ("interior", "studio", "sun")
 DEGREES, VIEWS = (4, 8, 16, 30), 32
+FILTERED = {"GGX 0.1": (30, 64, 128), "GGX 0.05": (128, 255), "GGX 0.02": (255,)}  # degrees; of the others 30
 DIFFERENTIATED = {"degree 16", "tolerance 0.02", "16", "64 x 128 map", "3 lobes"}  # settings
 PARTS = ("directions", "sharpness", "weights")  # of a table of Gaussians
 
@@ -66,6 +69,11 @@ class Scene:
     @property
     def glossy(self):
         return self.material != "clay"
+
+    @property
+    def alpha(self):
+        """1 of what is not glossy."""
+        return float(self.brdf.alpha) if self.glossy else 1.0
 
     def some(self, settings):
         """All settings, or the first two."""
@@ -143,7 +151,8 @@ def shisd(scene: Scene) -> list[Method]:
     light, projection = coefficients(scene.map)
     own = {"setup": seconds + projection, "ours": True}
     methods = []
-    for degree in scene.some(DEGREES) if scene.glossy else (2, *scene.some(DEGREES)):
+    degrees = scene.some(DEGREES) if scene.alpha > 0.08 else DEGREES[-1:]
+    for degree in degrees if scene.glossy else (2, *degrees):
         parameters = {"material": by_degree[degree], "light": light[:, : (degree + 1) ** 2]}
         forward, gradient = functions(shade, "light")
         methods.append(Method("shisd", f"degree {degree}", forward, parameters, gradient, **own))
@@ -171,7 +180,7 @@ def filtered_radiance(parameters, normals, views):
 
 def prefiltered(scene: Scene) -> list[Method]:
     methods = []
-    for degree in (30,) if scene.quick or scene.material != "GGX 0.1" else (30, 64):
+    for degree in (30,) if scene.quick else FILTERED.get(scene.material, (30,)):
         material, seconds = sharp_table(scene.material, degree)
         light = models.DistantLight(coefficients(scene.map)[0][:, : (degree + 1) ** 2])
         tolerances = (0.1, 0.05, 0.02, 0.005) if degree == 30 else (0.01,)
@@ -185,6 +194,14 @@ def prefiltered(scene: Scene) -> list[Method]:
             own = {"setup": seconds + filtering, "ours": True}
             methods.append(Method(f"shisd, filtered {degree}", setting, forward, parameters, gradient, **own))
     return methods
+
+
+def shade_by_plan(plan, normals, views):
+    return plan.shade(planned.NAME, shading.Surface(normals, views))
+
+
+def choices(scene: Scene) -> list[Method]:
+    return planned.methods(shade_by_plan, scene.brdf, environment(scene.map))
 
 
 # --- others
@@ -242,6 +259,8 @@ def _slices(table, local):
 
 
 def rotations(scene: Scene) -> list[Method]:
+    if scene.alpha < 0.2:
+        return []
     by_degree, seconds = slices(scene.material)
     light, projection = coefficients(scene.map)
     methods = []
@@ -292,9 +311,15 @@ def fit(material: str, count: int):
     return jax.vmap(decomposition.GaussianLobes)(*(jnp.asarray(part) for part in parts)), float(seconds)
 
 
-def make_fits():
-    arrays = {}
-    for material, brdf in MATERIALS.items():
+def stored_arrays(path: Path, chosen) -> dict:
+    """What is there, unless all materials are made again."""
+    return {} if set(chosen) == set(MATERIALS) else dict(np.load(path))
+
+
+def make_fits(chosen):
+    arrays = stored_arrays(FITTED, chosen)
+    for material in chosen:
+        brdf = MATERIALS[material]
         for count in (1, 3, 7):
             kind, name = f"{type(brdf).__name__}, {count} Gaussians", f"{material}, {count}"
             table, seconds = timed(lambda brdf=brdf, count=count: lobes.fit_table(brdf, count), kind)
@@ -320,7 +345,7 @@ def gaussians(scene: Scene) -> list[Method]:
     return methods
 
 
-FAMILIES = (shisd, prefiltered, estimators, fixed_lights, rotations, split_sums, gaussians)
+FAMILIES = (shisd, prefiltered, choices, estimators, fixed_lights, rotations, split_sums, gaussians)
 
 
 def tasks(quick: bool) -> Iterator[Task]:
@@ -341,17 +366,18 @@ def tasks(quick: bool) -> Iterator[Task]:
 # --- references
 
 
-def make_references():
-    arrays = {}
+def make_references(chosen):
+    arrays = stored_arrays(STORED, chosen)
     normals, views = (np.asarray(a[:JUDGED], float) for a in pixels())
     for name in MAPS:
         texels = np.asarray(environment(name).texels, float)
-        for material, brdf in MATERIALS.items():
+        for material in chosen:
+            parts = 4 if float(MATERIALS[material].lobe_width) < 0.08 else 2
             with jax.enable_x64(True):
-                brdf = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), brdf)
+                brdf = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), MATERIALS[material])
                 shade = functools.partial(reference.shade_environment_quadrature, brdf, models.Environment(texels))
-                values = np.asarray(shade(normals, views, supersampling=2))
-                finer = np.asarray(shade(normals[:16], views[:16], supersampling=4))
+                values = np.asarray(shade(normals, views, supersampling=parts))
+                finer = np.asarray(shade(normals[:16], views[:16], supersampling=2 * parts))
             error = np.sqrt(np.mean((values[:16] - finer) ** 2) / np.mean(finer**2))
             arrays[f"{material}, {name}"], arrays[f"{material}, {name}: error"] = values, error
             print(f"{material}, {name}: RMS {np.sqrt(np.mean(values**2)):.4g}, error {error:.1e}", flush=True)
@@ -361,6 +387,7 @@ def make_references():
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--make", action="store_true", required=True, help="make the stored references and fits again")
-    parser.parse_args()
-    make_fits()
-    make_references()
+    parser.add_argument("--only", choices=MATERIALS, action="append", help="of these materials; the others stay")
+    chosen = parser.parse_args().only or list(MATERIALS)
+    make_fits(chosen)
+    make_references(chosen)

@@ -18,6 +18,7 @@ from shisd.io.internal import write_atomically
 from tests.bench import timing
 from tests.bench.timing import interleaved
 
+LEVELS = (0.1, 0.03, 0.01, 0.003, 0.001)  # errors at which families are compared
 HISTOGRAM = np.array([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, np.inf])  # of |error| over the RMS of the reference
 
 
@@ -144,6 +145,31 @@ def lead(rows: list[dict], item: str, worst: float = 0.1) -> list[dict]:
     return table
 
 
+def cheapest(rows: list[dict], item: str, error: float) -> dict | None:
+    """The fastest row with this error at most."""
+    good = [r for r in rows if r["relative RMSE"] <= error]
+    return min(good, key=lambda r: r[f"us/{item}"]) if good else None
+
+
+def at_levels(rows: list[dict], item: str, planned: str) -> dict[str, str]:
+    """For every level of error, the time of the cheapest other over our cheapest, and over the cheapest `planned`.
+
+    Of rows whose error is the level at most; `planned` is a family of ours. Below 1 the other is ahead: bold.
+    """
+    ours = [r for r in rows if r["ours"]]
+    cells = {}
+    for level in LEVELS:
+        other = cheapest([r for r in rows if not r["ours"]], item, level)
+        own = [cheapest(x, item, level) for x in (ours, [r for r in ours if r["family"] == planned])]
+        if other is None:
+            cells[f"{100 * level:g} %"] = "-" if own[0] is None else "ours only"
+            continue
+        ratios = [None if r is None else other[f"us/{item}"] / r[f"us/{item}"] for r in own]
+        show = lambda x: "-" if x is None else f"**{x:.2g}**" if x < 1 else f"{x:.2g}"
+        cells[f"{100 * level:g} %"] = f"{show(ratios[0])}, {show(ratios[1])} ({other['family']})"
+    return cells
+
+
 def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3) -> None:
     """Error against time, both logarithmic, a panel for every title; a line joins the settings of a family."""
     import matplotlib
@@ -163,7 +189,7 @@ def draw(panels: dict[str, list[dict]], item: str, path: Path, columns: int = 3)
     families = list(dict.fromkeys(r["family"] for rows in panels.values() for r in rows))
     others = iter(pyplot.get_cmap("tab10")(np.arange(10)))
     ours = {r["family"] for rows in panels.values() for r in rows if r["ours"]}
-    reds = iter(["#c00000", "#ff7f50", "#800040", "#e6a000"])
+    reds = iter(["#c00000", "#ff7f50", "#800040", "#e6a000", "#ff0090", "#8b4513", "#b8860b", "#600000"])
     style = {f: next(reds) if f in ours else next(others) for f in families}
     for axis, (title, rows) in zip(axes.flat, panels.items(), strict=False):
         for family in families:

@@ -16,7 +16,17 @@ import jax
 import numpy as np
 
 from shisd.io.internal import write_atomically
-from tests.bench import applications, environments, harness, history, local_lights, renderers, roofline, spherical
+from tests.bench import (
+    applications,
+    environments,
+    harness,
+    history,
+    local_lights,
+    planned,
+    renderers,
+    roofline,
+    spherical,
+)
 from tests.bench.run import DOCS, README, paste, table
 
 GROUPS = {  # name: (title, tasks)
@@ -48,6 +58,11 @@ HEADLINES = {  # of README: (task, family) of the tables to what they are called
         "1,000 rotations of an RGB expansion, degree 8", "e3nn-jax"
     ),
 }  # fmt: skip
+PLANNED = ("environments", "local_lights")  # groups whose pixels are planned for
+AHEAD = """Where others are ahead at equal error: the time of the cheapest other whose error is at most that of the
+column, over the time of our cheapest, then over that of the cheapest plan (`planning.plan`); in brackets the other.
+Errors are those measured. Below 1, bold, it is ahead; "-": none of ours, or no plan, is as near; "ours only": none of
+the others is; "-" alone: nothing is."""
 APART = ("applications",)  # only when named: `make applications`, and with a file of its own
 
 
@@ -84,6 +99,11 @@ def leads(panels: dict[str, list[dict]], item: str) -> list[dict]:
             line[row["family"]] = "-" if ratio is None else f"{ratio:.2g} at {row['its error']:.1g}"
         lines.append(line)
     return lines
+
+
+def ahead(panels: dict[str, list[dict]], item: str) -> list[dict]:
+    """A row for every task, a column for every level of error: see `harness.at_levels`."""
+    return [{"task": title, **harness.at_levels(rows, item, planned.FAMILY)} for title, rows in panels.items()]
 
 
 def headlines(found: dict[tuple[str, str], str]) -> list[dict]:
@@ -139,8 +159,10 @@ def main() -> None:
             shown = f"![{title}: relative error against us per {item}](figures/{file})\n\n{lead}"
             led = leads(of_item, item)
             cells |= {(line["task"], family): cell for line in led for family, cell in line.items() if " at " in cell}
-            short += [shown, table(led)]
-            long += [shown, table(led)]
+            both = [shown, table(led)]
+            if name in PLANNED and item == "pixel":
+                both += [AHEAD, table(ahead(of_item, item))]
+            short, long = [*short, *both], [*long, *both]
             long.append("Every method: medians of its costs, and its relative RMSE in each task.")
             long.append(table(summary(of_item, item)))
         if name == "renderers":
