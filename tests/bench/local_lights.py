@@ -2,7 +2,7 @@
 
 Scenes, float32, 16,384 points: a floor with slightly varied normals, views to 80 degrees from them, below a panel
 ("floor"), beside a screen that stands on it, from 0.1 of its height on ("wall"), or below a tilted lamp of side 0.3 at
-twice the panel's height ("small"); each for five alphas.
+height 2 ("small"); each for five alphas.
 
 Families (kernels and their sources: `area_lights`): ours, `shade` with a `PolygonLight` or `PortalLight` and slices
 fitted above the horizon, slices beyond maps of directions, or the model at points; what is planned of them
@@ -32,6 +32,7 @@ import functools
 import sys
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import equinox as eqx
@@ -305,15 +306,16 @@ def projection_task(degree: int, stored, quick: bool) -> Task:
     )
 
 
-def tasks(quick: bool) -> list[Task]:
+def tasks(quick: bool) -> Iterator[Task]:
+    """One after another, so that programs may be forgotten in between."""
     stored = np.load(FILE)
-    if quick:
-        return [polygon_task("floor", "GGX 0.5", stored, True), projection_task(8, stored, True)]
-    return [
-        *(polygon_task(scene, name, stored, False) for scene in QUADS for name in ALPHA),
-        portal_task("GGX 0.5", stored),
-        *(projection_task(degree, stored, False) for degree in (8, 30)),
-    ]
+    for scene in ("floor",) if quick else QUADS:
+        for name in ("GGX 0.5",) if quick else ALPHA:
+            yield polygon_task(scene, name, stored, quick)
+    if not quick:
+        yield portal_task("GGX 0.5", stored)
+    for degree in (8,) if quick else (8, 30):
+        yield projection_task(degree, stored, quick)
 
 
 # ---- references
