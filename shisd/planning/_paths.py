@@ -2,6 +2,7 @@
 
 import abc
 import functools
+import math
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
@@ -236,7 +237,7 @@ class Polygon(AboveHorizon):
         points = len(light.light.points)
         moments = 12 * points * (degree + 1) * axes
         products = _lookup(material, degree) + material.colours * (moments + rows * axes)
-        return 50 + 85 * points + 0.06 * products + _azimuth_cost(material, degree)
+        return 50 + 85 * points * material.colours**0.55 + 0.06 * products + _azimuth_cost(material, degree)
 
 
 class Portal(AboveHorizon):
@@ -324,7 +325,7 @@ class Maps(Sampled):
     def cost(material, light, degree):
         if not Maps.serves(material, light):
             return np.inf
-        return Polygon.cost(material, light, degree) + 0.6 * Polygon.cost(material, light, 2)
+        return Polygon.cost(material, light, degree) + 0.8 * Polygon.cost(material, light, 2)
 
 PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Filtered, Polygon, Portal, Points, PortalPoints, Maps)
 
@@ -341,8 +342,9 @@ def _samples(material: Material, light: Local) -> tuple[Surface, np.ndarray, np.
     else:
         count = max(16, 16 * _FACING // len(light.normals))
         normals = np.repeat(light.normals[:, None], count, axis=1)
-    steps = np.array([0.7548776662466927, 0.5698402909980532])[:, None, None]
-    u, v = np.modf(steps * (np.arange(normals.shape[1]) + 0.5)[:, None])[0]
+    count = len(light.points), normals.shape[1]  # every view is another one
+    steps = np.array([0.7548776662466927, 0.5698402909980532])[:, None, None, None]
+    u, v = np.modf(steps * (np.arange(math.prod(count)).reshape(*count, 1) + 0.5))[0]
     sine, turn = np.sqrt(u), 2 * np.pi * v  # of the angle between normal and view: cos^2 is even
     across, upon = (np.moveaxis(np.asarray(x), 0, -1) for x in tangents(jnp.moveaxis(normals, -1, 0)))
     views = np.sqrt(1 - u) * normals + sine * (np.cos(turn) * across + np.sin(turn) * upon)
