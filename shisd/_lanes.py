@@ -8,7 +8,7 @@ takes longer than the arithmetic for some hundred points (jax 0.10.2: clipping a
 import functools
 import os
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -79,6 +79,31 @@ def _in_chunks(function: Callable[..., Result], arrays: tuple[Array, ...], share
     # the loop is all that is in the kernel: what is outside of loops may be split between threads, which fails in it
     result = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(function, *filled, *shared))
     return jax.tree.map(lambda a: a[..., :count], _tagged(jax.jit(loop)(result, filled, shared)))
+
+
+_VECTOR = set(
+    "abs acos add add_any and asin atan atan2 broadcast_in_dim cbrt ceil clamp concatenate convert_element_type copy "
+    "cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg "
+    "not or pow reduce_and reduce_max reduce_min reduce_or reduce_sum rem reshape round rsqrt select_n sign sin sinh "
+    "slice sqrt square squeeze stack stop_gradient sub tan tanh transpose xor".split()
+)
+_CALLS = {"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}
+
+
+def kernel_takes(function: Callable, *inputs: object) -> bool:
+    """Whether a function that others wrote can be part of `in_lanes`: arithmetic, and sums over short axes, as of xyz.
+
+    What cannot fails where the whole program is compiled, too late to do without the kernel.
+    """
+    return one_kernel() and _is_vector_code(jax.make_jaxpr(function)(*inputs).jaxpr)
+
+
+def _is_vector_code(jaxpr: Any) -> bool:
+    for equation in jaxpr.eqns:
+        inner = [getattr(x, "jaxpr", x) for x in equation.params.values() if hasattr(x, "jaxpr") or hasattr(x, "eqns")]
+        if equation.primitive.name not in (_CALLS if inner else _VECTOR) or not all(map(_is_vector_code, inner)):
+            return False
+    return True
 
 
 @functools.cache

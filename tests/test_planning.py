@@ -240,7 +240,7 @@ def test_what_values_of_a_model_cost():
     """Series and tables make most of it: SGD takes 30 times as long as GGX."""
     cost = lambda brdf: known_material(brdf, 1, 4).evaluation
     satin, painted = cost(MATERIALS["satin"]), cost(models.SgdMicrofacet(**GOLD_PAINT))
-    assert 5 < satin < 20 and 15 * satin < painted < 60 * satin
+    assert 2 < satin < 8 and 15 * satin < painted < 60 * satin
 
 
 def test_points_are_judged_from_the_surfaces_of_the_scene(rng):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import _checks
+from shisd._lanes import kernel_takes
 from shisd._typing import Array, Float
 from shisd.harmonics import multiply, sphere_rule
 from shisd.harmonics.internal import host_basis, of_order, zonal_norms
@@ -62,9 +63,11 @@ class Material:
 
     @functools.cached_property
     def evaluation(self) -> float:
-        """Nanoseconds that one value of the model takes, by its operations."""
+        """Nanoseconds that one value of the model takes in one kernel, by its operations; more where it takes none."""
         direction = jax.ShapeDtypeStruct((3,), np.float32)
-        return _nanoseconds(jax.make_jaxpr(self.brdf.value_cosine)(direction, direction).jaxpr)
+        inside = kernel_takes(self.brdf.value_cosine, direction, direction)
+        value = jax.make_jaxpr(self.brdf.value_cosine)(direction, direction)
+        return (1.0 if inside else OUTSIDE) * _nanoseconds(value.jaxpr)
 
     def beyond_maps(self, degree: int) -> TransformedSlices:
         """Expansions beyond maps of directions, made when first asked for."""
@@ -84,16 +87,17 @@ class Material:
         return np.sqrt(square)
 
 
+OUTSIDE = 2.5  # times as long without the kernel
 _LONG = {"exp", "exp2", "expm1", "log", "log1p", "pow", "sin", "cos", "tan", "atan2", "gather", "while", "scan"}
 
 
 def _nanoseconds(jaxpr: Any) -> float:
-    """On one value: vector code takes 0.05 for an operation, what stands for a table or a series 7."""
+    """On one value: vector code takes 0.02 for an operation, what stands for a table or a series 3."""
     total = 0.0
     for equation in jaxpr.eqns:
         inner = [getattr(x, "jaxpr", x) for x in equation.params.values() if hasattr(x, "jaxpr") or hasattr(x, "eqns")]
         size = max((math.prod(out.aval.shape) for out in equation.outvars), default=1)
-        own = (7.0 if equation.primitive.name in _LONG else 0.05) * size
+        own = (3.0 if equation.primitive.name in _LONG else 0.02) * size
         total += sum(map(_nanoseconds, inner)) if inner else own
     return total
 

@@ -16,7 +16,7 @@ from shisd._typing import Array, Float
 from shisd.decomposition import fibonacci_directions
 from shisd.harmonics import convolve, evaluate
 from shisd.models import DistantLight, PolygonLight, PortalLight, ZonalLight
-from shisd.planning._bands import Distant, Local, Material, predict, worst
+from shisd.planning._bands import OUTSIDE, Distant, Local, Material, predict, worst
 from shisd.shading import Prefiltered, Quadrature, Slices, Surface, prefilter, shade
 from shisd.shading.internal import as_type, best_channels, finite_mark, finite_or_nan, maps_of, shade_points
 
@@ -294,7 +294,8 @@ class Points(Sampled):
     def cost(material, light, degree):
         quads = len(light.light.points) // 2  # one more where the horizon cuts
         through = light.colours * (light.light_degree + 1) * (2 * light.light_degree + 1) if light.light_degree else 0
-        return 80 + 30 * quads + quads * degree**2 * (3 + material.evaluation + 0.1 * through)
+        evaluation = material.evaluation if through == 0 else OUTSIDE * material.evaluation + 0.1 * through
+        return 80 + 30 * quads + quads * degree**2 * (1 + evaluation)
 
 
 class PortalPoints(Points):

@@ -188,8 +188,8 @@ MUTANTS = [
     Mutant(
         "every value of a model as long as that of another",
         "shisd/planning/_bands.py",
-        old="own = (7.0 if equation.primitive.name in _LONG else 0.05) * size",
-        new="own = 0.05 * size",
+        old="own = (3.0 if equation.primitive.name in _LONG else 0.02) * size",
+        new="own = 0.02 * size",
         test="tests/test_planning.py::test_what_values_of_a_model_cost",
     ),
 ]

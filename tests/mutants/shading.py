@@ -67,7 +67,8 @@ MUTANTS = [
     ),
     Mutant(
         "what an edge sweeps as if it did not turn", "shisd/shading/_quadrature.py",
-        old="weight * (start + t * change)", new="weight * (start + change / 2)",
+        old="(totals[0] + (1 - t) * value, totals[1] + t * value)",
+        new="(totals[0] + value / 2, totals[1] + value / 2)",
         test="tests/shading/test_quadrature.py::test_derivatives_in_everything",
     ),
     Mutant(

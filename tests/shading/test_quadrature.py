@@ -1,11 +1,15 @@
 """Materials themselves at Gauss points on lights, against quadrature of a textbook's formula and closed values."""
 
+from typing import ClassVar
+from unittest import mock
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from shisd import models, shading
+from shisd._lanes import kernel_takes, one_kernel
 from tests import truth
 from tests.hard_cases import unit
 from tests.marks import FLOAT64_FIRST
@@ -177,6 +181,39 @@ def test_derivatives_in_everything(x64, rng):
         want = (ends[0] - ends[1]) / 2e-5
         assert abs(want) > 1e-4
         np.testing.assert_allclose(np.sum(np.asarray(slope) * move), want, rtol=9e-9, err_msg=str(i))
+
+
+class Tabulated(models.AbstractBrdf):
+    """Lambertian by a table and a product of matrices, neither of which one kernel takes."""
+
+    isotropic: ClassVar[bool] = True
+    table: jax.Array
+
+    @property
+    def lobe_width(self):
+        return jnp.ones((), self.table.dtype)
+
+    def value(self, wi, wo):
+        place = (2 * jnp.abs(wi[2])).astype(jnp.int32)
+        return self.table.astype(wi.dtype)[place] * (jnp.outer(wo, wo) @ wo @ wo)
+
+
+@FLOAT64_FIRST
+def test_many_points_in_one_kernel_and_what_it_does_not_take(dtype):
+    """Each as it is alone."""
+    light, few = models.PolygonLight(OUTLINES["upright"].astype(dtype)), scene()
+    many = tuple(np.tile(a, (60, 1)) for a in few)
+    by = lambda brdf, where: shade(shading.Quadrature(brdf, 5), light, where, dtype)
+    found = []
+    asked = lambda *inputs: found.append(kernel_takes(*inputs)) or found[-1]
+    with mock.patch("shisd.shading._quadrature.kernel_takes", asked):
+        matt = by(models.Lambertian(np.asarray(0.5, dtype)), many)
+        shiny = by(ggx(dtype), many)
+        same = by(Tabulated(jnp.full(3, 0.5 / np.pi, dtype)), many)
+    assert found == [one_kernel(), one_kernel(), False]
+    limit = {"rtol": 2e-6 if dtype == np.float32 else 1e-13, "atol": 1e-7 if dtype == np.float32 else 1e-15}
+    np.testing.assert_allclose(same, matt, **limit)
+    np.testing.assert_allclose(shiny, np.tile(by(ggx(dtype), few), 60), **limit)
 
 
 def test_errors_name_the_argument(as_user):

@@ -60,16 +60,18 @@ def at_points(
     material: Quadrature, local: Array, light: tuple[Array, Array] | None, v: Loop, _: int, *, center: bool = False
 ) -> Float[Array, "*colour p"]:
     """Integrals of the model itself, times `light`: frames, and coefficients in world space."""
-    return integrate(_at_point, (material, local, light), v, material.order, center)
+    frame, incident = (None, None) if light is None else light
+    own = (local.T,) if frame is None else (local.T, jnp.moveaxis(frame, 0, -1))
+    return integrate(_at_point, (material, incident), own, v, material.order, center)
 
 
-def _at_point(inputs: tuple[Quadrature, Array, tuple[Array, Array] | None], w: Float[Array, "3 p"]) -> Array:
-    material, local, light = inputs
-    values = reflected(material, local, w)
-    if light is None:
+def _at_point(shared: tuple[Quadrature, Array | None], own: tuple[Array, ...], w: Float[Array, "3 p"]) -> Array:
+    (material, incident), (view, *frame) = shared, own
+    values = reflected(material, view, w)
+    if incident is None:
         return values
-    frame, incident = light
-    return times(values, evaluate(incident[..., None, :], jnp.einsum("pij,jp->pi", frame, w)))
+    world = jnp.stack([dot(row, w) for row in frame[0]], axis=-1)
+    return times(values, evaluate(incident[..., None, :], world))
 
 
 def _uniform(slices: Slices, table: Array, local: Array, v: Loop, spare: int) -> Float[Array, "*colour p"]:
