@@ -363,10 +363,10 @@ def _trusted(material: Material, light: Local, surface: Surface) -> tuple[np.nda
     radiance = by_points(_ORDERS[-1])
     for order in _EXACT:
         coarse, radiance = radiance, by_points(order)
-        doubt = _rms(radiance - coarse)
-        if np.all(doubt <= _NEAR * np.max(_rms(radiance))):
+        doubt, found = _rms(radiance - coarse), _rms(radiance)
+        missed = found < 0.5 * predict(material.norms, light.norms, material.shares)[0]  # a lobe between points
+        if np.all((doubt <= _NEAR * np.max(found)) & ~missed):
             return radiance, 0 * doubt
-    missed = _rms(radiance) < 0.5 * predict(material.norms, light.norms, material.shares)[0]  # a lobe between points
     if np.any(missed) or not Maps.serves(material, light):
         return radiance, np.where(missed, np.inf, doubt)
     low, high = (material.beyond_maps(degree) for degree in _MAPPED)
