@@ -216,7 +216,7 @@ def _project(
     parts = -(-count * quadrature // _NODES_AT_ONCE)
     some = -(-count // parts)
     views = jnp.pad(views, ((0, some * parts - count), (0, 0)), mode="edge").reshape(parts, some, 3)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], jax.lax.map(project, views))
+    return jax.tree.map(lambda x: x.reshape(parts * some, *x.shape[2:])[:count], jax.lax.map(project, views))
 
 
 def _ray_sums(
