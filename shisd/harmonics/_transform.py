@@ -283,9 +283,9 @@ def _azimuth_table(columns: int, degree: int, dtype: DTypeLike, cells: bool) -> 
     m = np.arange(2 * (degree // 2 + 1))
     norms = np.where(m == 0, 1, np.sqrt(2)) * (np.sinc(m / columns) if cells else 1)
     if columns > max(256, 2 * degree) and degree > 32:
-        return _round(norms * np.exp(-1j * np.pi * m / columns), np.result_type(dtype, np.complex64))
+        return rounded(norms * np.exp(-1j * np.pi * m / columns), np.result_type(dtype, np.complex64))
     m_phi = np.outer(_quadrature.azimuths(columns), m)
-    return _round(norms[:, None] * np.stack([np.cos(m_phi), np.sin(m_phi)], axis=-1), dtype)
+    return rounded(norms[:, None] * np.stack([np.cos(m_phi), np.sin(m_phi)], axis=-1), dtype)
 
 
 @functools.cache
@@ -307,7 +307,7 @@ def _row_table(rule: Rows, rows: int, degree: int, dtype: DTypeLike, columns: in
             table *= weights[:half, None]
         table *= 2 * np.pi / columns
         table[:, rows // 2 :] /= 2  # a row on the equator is its own mirror image and counts twice
-    return _round(np.stack([table[:, :, 0::2], table[:, :, 1::2]]), dtype)
+    return rounded(np.stack([table[:, :, 0::2], table[:, :, 1::2]]), dtype)
 
 
 def _cell_moments(theta: np.ndarray, rows: int, k: np.ndarray) -> np.ndarray:
@@ -347,7 +347,7 @@ def series_table(degree: int, dtype: DTypeLike) -> np.ndarray:
     series = np.zeros((2 * n,) * 3)
     series[: degree + 1, : degree + 1, : degree + 1] = _tables.polar_series(degree)  # m, k, l
     blocks = series.reshape(n, 2, n, 2, n, 2)  # h q k p i p
-    return _round(np.stack([blocks[:, :, :, p, :, p].transpose(1, 0, 3, 2) for p in (0, 1)]), dtype)
+    return rounded(np.stack([blocks[:, :, :, p, :, p].transpose(1, 0, 3, 2) for p in (0, 1)]), dtype)
 
 
 @functools.cache
@@ -359,7 +359,7 @@ def _block_index(degree: int) -> np.ndarray:
     return np.ravel_multi_index(place, (2, 2, n, n, 2)).astype(np.int32)  # int64 fails once traced in both precisions
 
 
-def _round(table: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+def rounded(table: np.ndarray, dtype: DTypeLike) -> np.ndarray:
     """`table` in `dtype`, at an address that JAX on a CPU uses in place rather than copy at every call."""
     size = table.size * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)

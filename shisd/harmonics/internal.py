@@ -11,6 +11,11 @@ from shisd.harmonics._pairing import rows as rows
 from shisd.harmonics._pairing import turned_series as turned_series
 from shisd.harmonics._products import product_matrices as product_matrices
 from shisd.harmonics._quadrature import gauss_rows as gauss_rows
+from shisd.harmonics._rays import RayTables as RayTables
+from shisd.harmonics._rays import ray_tables as ray_tables
+from shisd.harmonics._rays import ray_waves as ray_waves
+from shisd.harmonics._rays import sums_about as sums_about
+from shisd.harmonics._rays import turned_from_axis as turned_from_axis
 from shisd.harmonics._rotation import rotate_many as rotate_many
 from shisd.harmonics._sh import angles_of as angles_of
 from shisd.harmonics._sh import basis_at as basis_at

@@ -5,20 +5,18 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from shisd import _checks
 from shisd._lanes import kernel_takes
-from shisd._typing import Array, Float
 from shisd.harmonics import multiply, sphere_rule
 from shisd.harmonics.internal import host_basis, of_order, zonal_norms
 from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
 from shisd.planning._scene import Light
 from shisd.shading import TransformedSlices, project_light, transform_brdf
-from shisd.shading.internal import RIDGE, as_type, hemisphere_blocks, project_slice
+from shisd.shading.internal import RIDGE, as_type, hemisphere_blocks, project_slices
 
 _ELEVATIONS = 12  # of the views whose slices are judged: Gauss nodes
 _AZIMUTHS = 6  # of these views, for anisotropic materials
@@ -182,16 +180,10 @@ def known_material(brdf: AbstractBrdf, degree: int, elevations: int) -> Material
     azimuths = np.arange(1 if brdf.isotropic else _AZIMUTHS) / _AZIMUTHS
     theta, phi = (x.ravel() for x in np.meshgrid((nodes + 1) * np.pi / 4, 2 * np.pi * azimuths, indexing="ij"))
     local = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
-    c = np.asarray(_slices(brdf, jnp.asarray(local, float), degree), float)  # [V, *colour, n]
+    c = np.asarray(project_slices(brdf, jnp.asarray(local, float), degree, 32 + degree)[0], float)  # [V, *colour, n]
     shares = np.repeat(weights, len(azimuths)) * np.sin(2 * theta)
     coefficients = np.moveaxis(c.reshape(len(theta), -1, c.shape[-1]), 0, 1)
     return Material(coefficients, theta, shares / np.sum(shares), c.ndim == 3, brdf.isotropic, elevations, brdf)
-
-
-@eqx.filter_jit
-def _slices(brdf: AbstractBrdf, views: Float[Array, "v 3"], degree: int) -> Float[Array, " v *colour_n"]:
-    width = jnp.asarray(brdf.lobe_width, views.dtype)
-    return jax.lax.map(lambda view: project_slice(brdf, view, width, degree, 32 + degree), views)
 
 
 def known_light(name: str, light: Light, points: Any, degree: int, normals: Any = None) -> Seen:

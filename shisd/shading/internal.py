@@ -8,6 +8,6 @@ from shisd.shading._tiles import finite_mark as finite_mark
 from shisd.shading._tiles import finite_or_nan as finite_or_nan
 from shisd.shading._tiles import shade_points as shade_points
 from shisd.shading._tiles import sum_parts as sum_parts
-from shisd.shading.slices._tabulate import project_slice as project_slice
+from shisd.shading.slices._tabulate import project_slices as project_slices
 from shisd.shading.slices._upper import RIDGE as RIDGE
 from shisd.shading.slices._upper import hemisphere_blocks as hemisphere_blocks

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import models, shading
-from shisd.shading.slices._tabulate import project_slice
+from shisd.shading.slices._tabulate import project_slices
 from tests.bench.timing import interleaved
 
 COUNT = 16384
@@ -30,7 +30,6 @@ TABLES, MATRICES = (16, 64), (8, 16, 24, 32)
 
 def slices(brdf: models.AbstractBrdf, degree: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Slices [v, n] of the material, and its squared norms [v], from quadrature at each view."""
-    width = jnp.asarray(brdf.lobe_width)
     nodes, weights = np.polynomial.legendre.leggauss(128)
     polar, area = np.pi / 4 * (nodes + 1), np.repeat(weights, 256) * (np.pi / 4) * (2 * np.pi / 256)
     polar, phi = (a.ravel() for a in np.meshgrid(polar, 2 * np.pi * (np.arange(256) + 0.5) / 256, indexing="ij"))
@@ -40,7 +39,7 @@ def slices(brdf: models.AbstractBrdf, degree: int, theta: np.ndarray) -> tuple[n
 
     def one(view):
         values = jax.vmap(lambda wi: brdf.value_cosine(wi, view))(w)
-        return project_slice(brdf, view, width, degree, 48 + degree), jnp.sum(values**2 * area)
+        return project_slices(brdf, view[None], degree, 48 + degree)[0][0], jnp.sum(values**2 * area)
 
     views = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1)
     c, squares = jax.jit(lambda v: jax.lax.map(one, v))(jnp.asarray(views, jnp.float32))

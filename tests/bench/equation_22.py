@@ -13,7 +13,7 @@ import numpy as np
 
 from shisd import harmonics, models, shading
 from shisd.harmonics.internal import bands
-from shisd.shading.slices._tabulate import project_slice
+from shisd.shading.slices._tabulate import project_slices
 
 
 def local_frames(normals, views):
@@ -97,7 +97,7 @@ def exact_slices(brdf, light, normals, views):
         def pixel(normal, view):
             frame, theta = local_frames(normal, view)
             local = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-            c = project_slice(brdf, local, jnp.asarray(brdf.lobe_width, float), degree, 32 + degree)
+            c = project_slices(brdf, local[None], degree, 32 + degree)[0][0]
             return jnp.asarray(light, float) @ harmonics.rotate(c, frame)
 
         return np.asarray(jax.lax.map(lambda nv: pixel(*nv), (jnp.asarray(normals, float), jnp.asarray(views, float))))

@@ -310,11 +310,10 @@ def shade_profiles(table, texels, normals, views, at, height=128):
 def sparse_table(brdf, degree, count):
     """The best `count` of 200 axes for each elevation, and their profiles."""
     basis = decomposition.RotatedZonalBasis(decomposition.fibonacci_directions(200, dtype=jnp.float32), degree)
-    width = jnp.asarray(brdf.lobe_width, jnp.float32)
 
     def choose(theta):
         view = jnp.stack([jnp.sin(theta), jnp.zeros_like(theta), jnp.cos(theta)])
-        c = _tabulate.project_slice(brdf, view, width, degree, 48)
+        c = _tabulate.project_slices(brdf, view[None], degree, 48)[0][0]
         weights, axes = decomposition.sparse_weights(basis, c, count)
         return decomposition.ZonalLobes(basis.directions[axes], weights[..., axes])
 

@@ -123,6 +123,13 @@ MUTANTS = [
         test="tests/shading/test_tables.py::test_rules_are_tried_until_one_meets_the_tolerance",
     ),
     Mutant(
+        "rules of quadrature that are mixed up",
+        "shisd/shading/slices/_tabulate.py",
+        old="fine, less, least = jnp.moveaxis(c, 1, 0)",
+        new="less, fine, least = jnp.moveaxis(c, 1, 0)",
+        test="tests/shading/test_tables.py::test_the_stated_error_is_that_of_the_table",
+    ),
+    Mutant(
         "nodes that are float64",
         "shisd/shading/slices/_tabulate.py",
         old="ends = [k * np.pi / 2 for k in range(2 if half else 4)]",

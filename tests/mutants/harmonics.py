@@ -93,6 +93,20 @@ MUTANTS = [
         test=f"{_OF_SH}::test_expansions_against_the_basis",
     ),
     Mutant(
+        "sums over rays turned the other way",
+        "shisd/harmonics/_rays.py",
+        old="(1 - 2 * np.eye(2))",
+        new="(2 * np.eye(2) - 1)",
+        test="tests/harmonics/test_rays.py::test_sums_over_rays_are_turned_from_the_axis[5-True-float32]",
+    ),
+    Mutant(
+        "waves about the axis that are not normalised",
+        "shisd/harmonics/_rays.py",
+        old="np.where(np.arange(2 * n) == 0, 1, np.sqrt(2))",
+        new="np.where(np.arange(2 * n) == 0, 1, 2)",
+        test="tests/harmonics/test_rays.py::test_sums_over_rays_are_turned_from_the_axis[5-True-float32]",
+    ),
+    Mutant(
         "rotation that does nothing",
         _ROTATION,
         old="    return rotate_many(flat, r[None], degree)[..., 0].T.reshape(c.shape)\n",

@@ -22,13 +22,14 @@ from shisd._numerics import safe_sqrt
 from shisd._progress import Progress, reporting
 from shisd._typing import Array, ArrayLike, DTypeLike, Float, Scalar
 from shisd.decomposition import RotatedZonalBasis
-from shisd.harmonics.internal import orders, weighted_sums
+from shisd.harmonics.internal import RayTables, ray_tables, ray_waves, sums_about, turned_from_axis
 from shisd.models import AbstractBrdf
 from shisd.shading import _views
 from shisd.shading.slices._slices import Slices, check_domain
 from shisd.shading.slices._upper import RIDGE, hemisphere_modes, unit_gauss
 
 Pytree = TypeVar("Pytree")
+_NODES_AT_ONCE = 2048  # of one ray for each of several views: more leave the cache
 Norms = tuple[float | None, ...]  # in which errors are judged: on the sphere (None), or of fits above the horizon
 
 
@@ -156,7 +157,7 @@ def slices_at(
     """SH coefficients of the slices at elevations `theta` of the view, and the quadrature's error in the worst norm."""
     local = view_grid(theta, azimuths, brdf.isotropic).astype(dtype)
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(brdf))
-    project = lambda views: _project(brdf, views, degree, quadrature, norms)
+    project = lambda views: project_slices(brdf, views, degree, quadrature, norms)
     if progress is None or traced:
         c, changes = project(local.reshape(-1, 3))
     else:
@@ -178,24 +179,69 @@ def view_grid(theta: np.ndarray, azimuths: int, isotropic: bool) -> np.ndarray:
     return np.stack([sine * np.cos(grid[1]), sine * np.sin(grid[1]), cosine], axis=-1)
 
 
-@eqx.filter_jit
-def _project(
-    brdf: AbstractBrdf, views: ArrayLike, degree: int, quadrature: int, norms: Norms
+def project_slices(
+    brdf: AbstractBrdf, views: ArrayLike, degree: int, quadrature: int, norms: Norms = ()
 ) -> tuple[Float[Array, " v *colour_n"], Float[Array, "v 3 norms *colour"]]:
     """Slices for every view [v, 3], and squared norms of what two steps of the rule change, and of the slices."""
     views = jnp.asarray(views)
+    return _project(brdf, views, degree, quadrature, norms, ray_tables(degree, views.dtype, brdf.isotropic))
+
+
+# The tables are arguments of the compiled function, not constants in it.
+@eqx.filter_jit
+def _project(
+    brdf: AbstractBrdf, views: Float[Array, "v 3"], degree: int, quadrature: int, norms: Norms, tables: RayTables
+) -> tuple[Float[Array, " v *colour_n"], Float[Array, "v 3 norms *colour"]]:
     width = jnp.asarray(jax.lax.stop_gradient(brdf.lobe_width), views.dtype)
     fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, brdf)
+    coarse = (3 * quadrature // 4, quadrature // 2)
+    rules = ((brdf, (quadrature,)), (fixed, coarse))[: 2 if norms else 1]
+    colour = jax.eval_shape(brdf.value_cosine, views[0], views[0]).shape
 
     @jax.checkpoint
-    def project(view: Float[Array, "3"]) -> tuple[Array, Array]:
-        fine = project_slice(brdf, view, width, degree, quadrature)
-        less, least = (project_slice(fixed, view, width, degree, q) for q in (3 * quadrature // 4, quadrature // 2))
+    def project(views: Float[Array, "b 3"]) -> tuple[Array, Array]:
+        sums = [jax.vmap(lambda view, b=b, q=q: _ray_sums(b, view, width, degree, q))(views) for b, q in rules]
+        x, y, cos, sin = _azimuth_and_elevation(views.T)
+        phi = None if brdf.isotropic else (x, y)
+        c = turned_from_axis(jnp.concatenate(sums, axis=-1), (cos, sin), phi, degree, tables)
+        c = c.reshape(len(views), -1, *colour, c.shape[-1])
+        if not norms:
+            return c[:, 0], jnp.zeros((len(views), 3, 0, *colour), c.dtype)
+        fine, less, least = jnp.moveaxis(c, 1, 0)
         still = jax.lax.stop_gradient(fine)
-        seen = jnp.stack([less - least, still - less, still])
-        return fine, jnp.stack([jnp.sum(jnp.square(_scaled(seen, ridge)), axis=-1) for ridge in norms], axis=1)
+        seen = jnp.stack([less - least, still - less, still], axis=1)
+        return fine, jnp.stack([jnp.sum(jnp.square(_scaled(seen, ridge)), axis=-1) for ridge in norms], axis=2)
 
-    return jax.lax.map(project, views)
+    count = len(views)
+    parts = -(-count * quadrature // _NODES_AT_ONCE)
+    some = -(-count // parts)
+    views = jnp.pad(views, ((0, some * parts - count), (0, 0)), mode="edge").reshape(parts, some, 3)
+    return jax.tree.map(lambda x: x.reshape(parts * some, *x.shape[2:])[:count], jax.lax.map(project, views))
+
+
+def _ray_sums(
+    brdf: AbstractBrdf, view: Float[Array, "3"], width: Scalar, degree: int, rules: tuple[int, ...]
+) -> Float[Array, "q h r k p rules_colours"]:
+    """w -> value_cosine(w, view) integrated with waves about the mirror direction, by every rule.
+
+    In one loop, as a model takes long to compile: shorter rays are filled up to the longest with nodes of no weight.
+    """
+    rays = [slice_rays(view, width, q, half=brdf.isotropic) for q in rules]
+    pad = lambda x, **kw: jnp.pad(x, ((0, 0), (0, max(rules) - x.shape[1])), **kw)
+    chi = jnp.concatenate([chi for chi, *_ in rays])
+    psi = jnp.concatenate([pad(psi, mode="edge") for _, psi, *_ in rays])
+    solid_angle = jnp.concatenate([pad(weight) for _, _, weight, _ in rays])
+    frame = rays[0][3]
+
+    @jax.checkpoint
+    def along(ray: tuple[Scalar, Array, Array]) -> Float[Array, "waves colours"]:
+        chi, psi, solid_angle = ray
+        w = _directions(chi[None], psi[None], frame)[0]
+        values = jax.vmap(lambda wi: brdf.value_cosine(wi, view))(w).reshape(len(w), -1)
+        return ray_waves(jnp.cos(psi), jnp.sin(psi), degree) @ (values * solid_angle[:, None])
+
+    sums, ends = jax.lax.map(along, (chi, psi, solid_angle)), np.cumsum([len(chi) for chi, *_ in rays])[:-1]
+    return sums_about(sums, jnp.cos(chi), jnp.sin(chi), brdf.isotropic, ends)
 
 
 def _scaled(c: Float[Array, "*batch n"], ridge: float | None) -> Float[Array, "*batch n"]:
@@ -222,32 +268,25 @@ def _as_table(
     return c, error
 
 
-def project_slice(
-    brdf: AbstractBrdf, view: Float[Array, "3"], width: Scalar, degree: int, quadrature: int
-) -> Float[Array, "*colour n"]:
-    """SH coefficients of w -> value_cosine(w, view), bands 0 ... degree."""
-    w, weight = slice_nodes(view, width, quadrature, half=brdf.isotropic)
-    values = jax.vmap(lambda wi: brdf.value_cosine(wi, view))(w)  # [nodes, *colour]
-    values *= weight.reshape(-1, *(1,) * (values.ndim - 1))
-    c = weighted_sums(values, w, degree)
-    # seen from azimuth 0, the slice is even in y: half the nodes do, and sine components vanish
-    return jnp.where(orders(degree) >= 0, c, 0) if brdf.isotropic else c
-
-
 def slice_nodes(
     view: Float[Array, "3"], width: Scalar, quadrature: int, *, half: bool
 ) -> tuple[Float[Array, "nodes 3"], Float[Array, " nodes"]]:
-    """Directions above the horizon and their solid angles, graded towards the mirror direction of `view`.
+    """Directions above the horizon and their solid angles, graded towards the mirror direction of `view`."""
+    chi, psi, solid_angle, frame = slice_rays(view, width, quadrature, half=half)
+    return _directions(chi, psi, frame).reshape(-1, 3), solid_angle.reshape(-1)
+
+
+def slice_rays(
+    view: Float[Array, "3"], width: Scalar, quadrature: int, *, half: bool
+) -> tuple[Float[Array, " x"], Float[Array, "x y"], Float[Array, "x y"], Float[Array, "3 3"]]:
+    """Nodes on rays from the mirror direction r of `view`: chi, psi, solid angles, and the rows a, b, r.
 
     psi = width sinh(s), which resolves the lobe and its tails alike. In chi, panels of an eighth of a turn are graded
     to the end near the plane of incidence, where lobes at grazing views are thin, or near the horizon's turning point,
-    where psi_max changes over an angle cos(theta_o).
+    where psi_max changes over an angle cos(theta_o). `half`: of what is even in chi, one side for both.
     """
-    cos_o = view[2]
-    sin_o = jnp.sqrt(view[0] ** 2 + view[1] ** 2)
-    x, y = view[0] / sin_o, view[1] / sin_o
-    mirror = jnp.stack([-view[0], -view[1], cos_o])
-    up, side = jnp.stack([x * cos_o, y * cos_o, sin_o]), jnp.stack([-y, x, jnp.zeros_like(x)])
+    x, y, cos_o, sin_o = _azimuth_and_elevation(view)
+    frame = jnp.stack([x * cos_o, y * cos_o, sin_o, -y, x, jnp.zeros_like(x), -view[0], -view[1], cos_o]).reshape(3, 3)
     node, gauss = unit_gauss(quadrature // 2)
     node, gauss = jnp.asarray(node, view.dtype), jnp.asarray(gauss, view.dtype)
     scale = jnp.arcsinh(np.pi / 4 / cos_o)
@@ -260,6 +299,16 @@ def slice_nodes(
     s_max = jnp.arcsinh(psi_max / width)[:, None]
     psi = width * jnp.sinh(node * s_max)
     solid_angle = jnp.sin(psi) * width * jnp.cosh(node * s_max) * s_max * gauss * d_chi[:, None]
+    return chi, psi, solid_angle, frame
+
+
+def _azimuth_and_elevation(view: Array) -> tuple[Array, Array, Array, Array]:
+    """Cosine and sine of a view's azimuth, then of its angle to the normal; components on the first axis."""
+    sine = jnp.sqrt(view[0] ** 2 + view[1] ** 2)
+    return view[0] / sine, view[1] / sine, view[2], sine
+
+
+def _directions(chi: Float[Array, " x"], psi: Float[Array, "x y"], frame: Float[Array, "3 3"]) -> Float[Array, "x y 3"]:
+    up, side, mirror = frame
     ring = jnp.cos(chi)[:, None] * up[None, :] + jnp.sin(chi)[:, None] * side[None, :]
-    w = jnp.cos(psi)[..., None] * mirror[None, None, :] + jnp.sin(psi)[..., None] * ring[:, None, :]
-    return w.reshape(-1, 3), solid_angle.reshape(-1)
+    return jnp.cos(psi)[..., None] * mirror[None, None, :] + jnp.sin(psi)[..., None] * ring[:, None, :]
