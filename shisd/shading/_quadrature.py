@@ -46,7 +46,7 @@ class Quadrature(Module):
     Derivatives: in the light's points, positions and frames that of the integral, as the model at points of the edges;
     it has an error of its own, smaller than that of the rule's derivative (a wall that the horizon cuts, alpha 0.5,
     order 4: 8e-3 for 1.6e-1). In views and the model, that of the rule. All orders, both modes. A gradient in
-    everything takes XXX times the value, in the lamp YYY (order 4, a panel, 16,384 points).
+    the lamp takes 4 times the value, in everything 9 times (0.21, 0.85 and 1.9 us a point: order 4, a panel, GGX).
     Cost: a model that is arithmetic alone is part of one kernel, 3 to 4 times faster than one that looks tables up or
     multiplies matrices.
     """
