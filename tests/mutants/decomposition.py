@@ -102,6 +102,13 @@ MUTANTS = [
         test="tests/shading/test_prefiltered.py::test_error_is_as_predicted[glossy-float32]",
     ),
     Mutant(
+        "truncation of the last window alone",
+        "shisd/shading/_prefiltered.py",
+        old="beyond + jnp.maximum(before - last, 0)",
+        new="beyond + before",
+        test="tests/shading/test_truncation.py::test_exponential_falls_are_continued_exactly[0.6]",
+    ),
+    Mutant(
         "sparse weights do not follow their axes",
         "shisd/decomposition/_sparse.py",
         old="columns = m[:, :, chosen]",

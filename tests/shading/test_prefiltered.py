@@ -117,7 +117,7 @@ def test_what_cannot_be_filtered_is_refused(rng, as_user):
         shading.prefilter(shading.Slices(slices.coefficients * np.nan), sky)
     with pytest.raises(ValueError, match="pass that as `like`"):
         jax.jit(lambda light: shading.prefilter(slices, light).maps)(sky)
-    with pytest.raises(ValueError, match=r"`light` must be a models.DistantLight; got ndarray\."):
+    with pytest.raises(ValueError, match=r"`light` must be a models.DistantLight or Environment; got ndarray\."):
         shading.prefilter(slices, e)
     with pytest.raises(ValueError, match="`coefficients` must have"):
         shading.prefilter(slices, models.DistantLight(e[:, :5]))

@@ -69,7 +69,9 @@ def tabulate_brdf(
     16), or larger, where convergence is fast. At 32 + degree nodes the true one is, at degree 30, in float32, 2e-7 for
     GGX of alpha 0.05, 1e-6, 1e-6 and 7e-5 for dielectric CookTorrance of roughness 0.35, 0.2 and 0.1; 4e-4 or less for
     tables in MERL's format at degree 16.
-    Cost: 1.8 elevations x quadrature^2 evaluations of the material; one view's harmonics are in memory at a time.
+    Cost: 3.9 elevations x quadrature^2 evaluations of an isotropic material, each with 4 (L+1) products. 64 elevations
+    of GGX at degree 256, RGB, took 20 s of one core and 1.9 GB in float32, and as long again to compile and make tables
+    the first time.
     """
     degree = degree.degree if isinstance(degree, RotatedZonalBasis) else _checks.degree(degree)
     check_domain(domain)
