@@ -221,10 +221,10 @@ def _channels(
     used, weight_or_1 = weight > 0, np.where(weight > 0, weight, 1)
     vectors, values, orders = [], [], []
     for order in range(degree + 1):
-        rows = (rest[:, order] * np.sqrt(shares)).reshape(degree + 1, -1) * weight[:, None]
-        u, s, _ = np.linalg.svd(rows, full_matrices=False)
-        vectors.append(u.T[: degree + 1 - order])
-        values.append(s[: degree + 1 - order])
+        rows = (rest[order:, order] * np.sqrt(shares)).reshape(degree + 1 - order, -1) * weight[order:, None]
+        squares, u = np.linalg.eigh(rows @ rows.T)  # singular values: LAPACK's own may not converge at degree 255
+        vectors.append(np.pad(u.T, ((0, 0), (order, 0))))
+        values.append(squares)
         orders.append(np.full(len(values[-1]), order))
     vectors, values, orders = (np.concatenate(x) for x in (vectors, values, orders))
     reduce, expand = vectors * weight, np.where(used, vectors / weight_or_1, 0)
