@@ -265,7 +265,7 @@ def _as_table(
     before, after, whole = jnp.tensordot(shares, changes.reshape(len(shares), -1, *changes.shape[1:]).sum(axis=1), 1)
     ratio = lambda a, b: jnp.where(a < b, a / jnp.where(a < b, b, 1), 1)  # at most 1; NaN of NaN
     square = after / jnp.where(whole > 0, whole, 1) * ratio(after, before)
-    error = jnp.maximum(2 * safe_sqrt(jnp.max(square)), 8 * float(jnp.finfo(c.dtype).eps))  # at least the rounding
+    error = jnp.maximum(2 * safe_sqrt(jnp.max(square)), 32 * float(jnp.finfo(c.dtype).eps))  # at least the rounding
     c = jnp.moveaxis(c.reshape(*views, *c.shape[1:]), range(len(views)), range(-1 - len(views), -1))  # colour first
     return c, error
 
