@@ -100,8 +100,10 @@ def prefilter(
     radiance relative to its RMS over all orientations and over the views of a sphere, of the worst colour, against
     `shade`. As many channels are kept as that takes; `error` of the result is what is predicted for
     it, and tests find it right within a factor of 2 on photographed maps. `truncation` is what is lacking beyond the
-    degree, with GGX of alpha 0.02 to 0.1 at degrees 64 and 128 on two such maps within a factor of 2 too, relative to
-    radiance over all orientations: where a picture shows no bright light, what it lacks may be more of what it has.
+    degree: with GGX of alpha 0.02 to 0.1 at degrees 64 and 128 on two such maps within a factor of 2 too, over all
+    orientations and views. A picture may show others. Of 64 pixels seen from up to 80 degrees, what was lacking was
+    1.9e-4 and not 2.8e-2 at alpha 0.1 and degree 128, as grazing views lack most, and 1.5 and not 0.1 at alpha 0.02 and
+    degree 64, as none mirrored a lamp.
     Channels are chosen from values, so not under jit, grad or vmap. There pass `like`, an earlier result: its channels
     are used again and only the tables are made, a pure function of `material` and `light`, linear in each.
     `error` is then that of its channels for this material and this light, and nothing holds it below `tolerance`:
@@ -110,7 +112,9 @@ def prefilter(
     values, but the slope in a material's roughness lacks what would need other channels, and a fit by it may end beside
     the best one: fit materials by `shade`, whose derivatives are exact, and filter what was found. Read
     `error` wherever material or light have moved, and choose anew where it has grown.
-    Cost: the maps hold 18 (L+1)^2 texels; each is a Fourier series, summed over rows, then over columns.
+    Cost: the maps hold 18 (L+1)^2 texels; each is a Fourier series, summed over rows, then over columns. At degree 255,
+    with RGB light and 1e-2, GGX of alpha 0.02, 0.05 and 0.1 took 56, 128 and 152 maps of a photographed interior, 0.8,
+    1.8 and 2.2 GB (up to 9 GB while they are made), and 17 to 21 s of one core.
     Source: ISD15 Eq. 22, whose zonal maps this extends to orders m > 0.
     """
     slices = slices_everywhere(as_material(material), "DistantLight")
