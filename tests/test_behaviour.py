@@ -625,7 +625,7 @@ CASES = [
         lambda: (prefiltered(), seen()),
         (1,),
         heavy=True,
-        idle=("reduce", "expand", "error"),
+        idle=("reduce", "expand", "error", "truncation"),
     ),
     Case("shading.reflect DistantLight", shading.reflect, lambda: (footprint(), distant()), (0,), heavy=True),
     Case(
