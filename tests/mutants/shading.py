@@ -103,7 +103,7 @@ MUTANTS = [
     ),
     Mutant(
         "a lobe between points is none", "shisd/planning/_paths.py",
-        old="np.where(missed, np.inf, doubt)", new="doubt",
+        old="np.max(found)) & ~missed)", new="np.max(found)))",
         test="tests/test_planning.py::test_points_are_chosen_where_they_are_cheapest",
     ),
     Mutant(
