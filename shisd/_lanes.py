@@ -98,9 +98,14 @@ def kernel_takes(function: Callable, *inputs: object) -> bool:
     return one_kernel() and _is_vector_code(jax.make_jaxpr(function)(*inputs).jaxpr)
 
 
+def inner_programs(equation: Any) -> list:
+    """Of a call in a traced program."""
+    return [getattr(x, "jaxpr", x) for x in equation.params.values() if hasattr(x, "jaxpr") or hasattr(x, "eqns")]
+
+
 def _is_vector_code(jaxpr: Any) -> bool:
     for equation in jaxpr.eqns:
-        inner = [getattr(x, "jaxpr", x) for x in equation.params.values() if hasattr(x, "jaxpr") or hasattr(x, "eqns")]
+        inner = inner_programs(equation)
         if equation.primitive.name not in (_CALLS if inner else _VECTOR) or not all(map(_is_vector_code, inner)):
             return False
     return True

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shisd import _checks
-from shisd._lanes import kernel_takes
+from shisd._lanes import inner_programs, kernel_takes
 from shisd.harmonics import multiply, sphere_rule
 from shisd.harmonics.internal import host_basis, of_order, zonal_norms
 from shisd.models import AbstractBrdf, DistantLight, Environment, PolygonLight, PortalLight
@@ -86,14 +86,14 @@ class Material:
 
 
 OUTSIDE = 2.5  # times as long without the kernel
-_LONG = {"exp", "exp2", "expm1", "log", "log1p", "pow", "sin", "cos", "tan", "atan2", "gather", "while", "scan"}
+_LONG = {"exp", "exp2", "expm1", "log", "log1p", "pow", "sin", "cos", "tan", "atan2", "gather"}
 
 
 def _nanoseconds(jaxpr: Any) -> float:
     """On one value: vector code takes 0.02 for an operation, what stands for a table or a series 3."""
     total = 0.0
     for equation in jaxpr.eqns:
-        inner = [getattr(x, "jaxpr", x) for x in equation.params.values() if hasattr(x, "jaxpr") or hasattr(x, "eqns")]
+        inner = inner_programs(equation)
         size = max((math.prod(out.aval.shape) for out in equation.outvars), default=1)
         own = (3.0 if equation.primitive.name in _LONG else 0.02) * size
         total += sum(map(_nanoseconds, inner)) if inner else own

@@ -192,7 +192,7 @@ def _choose(judged: Judge, material: Material, light: Seen, target: float, max_d
     found: list[Choice] = []
     for path in PATHS:
         if path.takes is light.kind:
-            cheapest = min((choice.cost for choice in found if choice.error <= target), default=math.inf) 
+            cheapest = min((choice.cost for choice in found if choice.error <= target), default=math.inf)
             found.extend(_first(judged, path, material, light, target, max_degree, cheapest))
     good = [choice for choice in found if choice.error <= target]
     return min(good, key=lambda c: c.cost) if good else min(found, key=lambda c: c.error)

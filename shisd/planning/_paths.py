@@ -328,6 +328,7 @@ class Maps(Sampled):
             return np.inf
         return Polygon.cost(material, light, degree) + 0.8 * Polygon.cost(material, light, 2)
 
+
 PATHS: tuple[type[Path], ...] = (Irradiance, Zonal, Table, Filtered, Polygon, Portal, Points, PortalPoints, Maps)
 
 

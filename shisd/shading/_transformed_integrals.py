@@ -140,8 +140,10 @@ def _even_integrals_jvp(degree, spare, primals, tangents):
     mapped, up = _beyond(s, v, True)
     value = _of_rows(lobes, base, mapped, up, v, degree, spare, even=True)
     change, ds, dv = jnp.zeros_like(value), jnp.zeros_like(s), jnp.zeros_like(v)
-    if not isinstance(d_tables[0], SymbolicZero):
-        change += jax.jvp(lambda t: _in_plane(t, theta, v, degree, spare), (tables,), (d_tables,))[1]
+    d_moved = {name: d for name, d in d_tables._asdict().items() if not isinstance(d, SymbolicZero)}
+    if d_moved:
+        of_moved = lambda moved: _in_plane(tables._replace(**moved), theta, v, degree, spare)
+        change += jax.jvp(of_moved, ({name: getattr(tables, name) for name in d_moved},), (d_moved,))[1]
     if not isinstance(du, SymbolicZero):
         dv += turned(du, cos, sin)
     if not isinstance(d_view, SymbolicZero):
@@ -171,9 +173,7 @@ def _moves(
     return jax.jvp(over, (mapped, v), (d_mapped, dv))[1]
 
 
-def _at_normal(
-    tables: Tables, v: Loop, steep: Bool[Array, " p"], degree: int, spare: int
-) -> Float[Array, "c p"]:
+def _at_normal(tables: Tables, v: Loop, steep: Bool[Array, " p"], degree: int, spare: int) -> Float[Array, "c p"]:
     """The change with a step across the plane of views next to the normal, if any are `steep`, or else 0."""
     none = lambda: jnp.zeros((tables.lobes.shape[0], v.shape[2]), v.dtype)
 

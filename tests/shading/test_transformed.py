@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -233,3 +234,17 @@ def test_errors_name_the_argument(as_user):
         shading.TransformedSlices(maps, c, base[..., :4])
     with pytest.raises(ValueError, match="`brdf` must be a models.AbstractBrdf; got float"):
         shading.transform_brdf(0.3, 4)
+
+
+def test_gradients_in_one_field_are_those_in_all(x64, rng):
+    c, maps = rng.normal(size=(2, 8, 9)), 0.1 * rng.normal(size=(8, 5))
+    slices = shading.TransformedSlices(maps, c[0], c[1])
+    lamp = models.PolygonLight(np.array([[-0.5, -0.5, 1.5], [-0.5, 0.5, 1.5], [0.5, 0.5, 1.5], [0.5, -0.5, 1.5]]))
+    surface = shading.Surface(np.array([0.0, 0, 1]), np.array([0.6, 0, 0.8]), np.zeros(3))
+    total = jax.jit(lambda slices: shading.shade(slices, lamp, surface))
+    whole = jax.grad(total)(slices)
+    for name in ("maps", "coefficients", "base"):
+        field = lambda s, name=name: getattr(s, name)
+        alone = jax.grad(lambda x, field=field: total(eqx.tree_at(field, slices, x)))(field(slices))
+        assert np.max(np.abs(alone)) > 1e-3
+        np.testing.assert_allclose(alone, field(whole), rtol=1e-12, atol=1e-14)
